@@ -1,0 +1,226 @@
+"""The one configuration schema: defaults, units, ranges and descriptions.
+
+The dotted keys of :class:`Config` (``map.voxel_size_m``) are the ROS parameters, the keys of the YAML files and what the
+command line's ``--set`` takes. Defaults are the paper's [sec: Parameter Overview] wherever it states one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.fields import FieldInfo
+
+from fus3dmaps_core.errors import ConfigError
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class EncoderConfig(_Section):
+    """Which vision-language encoders describe the images."""
+
+    name: str = Field("lite", description="Encoder trio: patch, crop and text encoder of one space.")
+    device: str = Field("cpu", description="Torch device of the encoders, e.g. cpu or cuda:0.")
+
+
+class SegmenterConfig(_Section):
+    """How images are cut into class-agnostic masks."""
+
+    name: str = Field("lite", description="Segmenter that proposes the masks.")
+    min_area_px: int = Field(400, ge=1, description="Masks with fewer pixels (at the working resolution) are dropped.")
+    max_border_contact: float = Field(
+        0.2, ge=0.0, le=1.0, description="Masks with a larger share of their contour on the image border are dropped."
+    )
+    max_masks: int = Field(64, ge=1, description="At most this many masks of a frame are used, largest first.")
+    crop_padding: float = Field(
+        0.05, ge=0.0, le=1.0, description="Padding around a mask's bounding box, as a share of its size."
+    )
+
+
+class ImageConfig(_Section):
+    """Working resolution and depth range."""
+
+    width: int = Field(640, ge=32, description="Width images are resized to, pixels.")
+    height: int = Field(480, ge=32, description="Height images are resized to, pixels.")
+    depth_min_m: float = Field(0.1, ge=0.0, description="Nearer depth readings give no point, metres.")
+    depth_max_m: float = Field(6.0, gt=0.0, description="Farther depth readings give no point, metres.")
+    depth_unit_m: float = Field(0.001, gt=0.0, description="Metres per unit of a 16-bit depth image (REP-118: 0.001).")
+
+
+class KeyframeConfig(_Section):
+    """Motion since the last keyframe that makes the next one; either threshold suffices."""
+
+    dense_translation_m: float = Field(0.08, ge=0.0, description="Translation for a dense keyframe, metres.")
+    dense_rotation_rad: float = Field(0.06, ge=0.0, description="Rotation for a dense keyframe, radians.")
+    instance_translation_m: float = Field(0.14, ge=0.0, description="Translation for an instance keyframe, metres.")
+    instance_rotation_rad: float = Field(0.11, ge=0.0, description="Rotation for an instance keyframe, radians.")
+
+
+class SamplingConfig(_Section):
+    """How many pixels of an encoder patch become points."""
+
+    dense_per_patch: int = Field(5, ge=1, le=256, description="Pixels sampled per patch for the dense layer.")
+    instance_per_patch: int = Field(9, ge=1, le=256, description="Pixels sampled per patch for the instance layer.")
+
+
+class MapConfig(_Section):
+    """The voxel map."""
+
+    voxel_size_m: float = Field(0.05, gt=0.0, le=10.0, description="Edge of a voxel, metres.")
+    max_hypotheses: int = Field(3, ge=1, le=16, description="Object hypotheses a voxel can hold (K).")
+    iou_threshold: float = Field(
+        0.2, ge=0.0, lt=1.0, description="Voxel IoU above which a proposal joins an existing instance."
+    )
+    dtype: Literal["float32", "float16"] = Field("float32", description="Storage type of dense embeddings.")
+    device: str = Field("cpu", description="Torch device that holds the map, e.g. cpu or cuda:0.")
+
+
+class FusionConfig(_Section):
+    """Cross-layer fusion and the sliding window."""
+
+    variance_ratio: float = Field(
+        0.0, ge=0.0, description="lambda = R_dense / R_instance; 0 takes the value of the encoder trio."
+    )
+    window_radius_m: float = Field(
+        0.0, ge=0.0, description="Radius of the sliding window of the dense layer, metres; 0 keeps the whole dense layer."
+    )
+    period_frames: int = Field(
+        5, ge=1, description="With a sliding window, fuse after every n-th processed frame."
+    )
+
+
+class QueryConfig(_Section):
+    """Answers to text queries."""
+
+    top_k: int = Field(5, ge=1, description="Instances returned where a query does not say how many.")
+    min_voxels: int = Field(4, ge=1, description="Instances with fewer voxels are not ranked.")
+
+
+class InputConfig(_Section):
+    """How messages become posed frames, live and from recordings."""
+
+    rgb_topic: str = Field("rgb/image", description="Colour images (sensor_msgs/Image).")
+    depth_topic: str = Field("depth/image", description="Depth images (sensor_msgs/Image), registered to colour.")
+    camera_info_topic: str = Field("rgb/camera_info", description="Camera model of the colour images.")
+    pose_topic: str = Field("pose", description="Camera poses (geometry_msgs/PoseStamped).")
+    odometry_topic: str = Field("odom", description="Camera poses (nav_msgs/Odometry).")
+    pose_source: Literal["pose", "odometry"] = Field("pose", description="Which of the two pose topics is used.")
+    T_body_camera: list[float] = Field(
+        [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0],
+        min_length=7,
+        max_length=7,
+        description="Pose of the camera's optical frame in the frame whose pose is published: x, y, z (m), qx, qy, qz, qw.",
+    )
+    sync_tolerance_s: float = Field(0.02, ge=0.0, description="Largest stamp difference of colour and depth, seconds.")
+    max_pose_gap_s: float = Field(0.5, gt=0.0, description="Poses farther apart than this are not interpolated, seconds.")
+    max_wait_s: float = Field(2.0, gt=0.0, description="Images that wait longer for depth or pose are dropped, seconds.")
+    map_frame: str = Field("map", min_length=1, description="Frame of the poses and of everything published.")
+
+
+class NodeConfig(_Section):
+    """The ROS node."""
+
+    queue_size: int = Field(4, ge=1, description="Frames that wait for the worker; the oldest is dropped when full.")
+    input_qos: Literal["sensor_data", "reliable"] = Field("sensor_data", description="QoS profile of the inputs.")
+    publish_period_s: float = Field(2.0, gt=0.0, description="Period of ~/map and ~/instances while someone subscribes.")
+    map_directory: str = Field("~/.ros/fus3dmaps", min_length=1, description="Directory that holds saved maps.")
+
+
+class Config(_Section):
+    """Everything that can be configured."""
+
+    encoder: EncoderConfig = EncoderConfig()
+    segmenter: SegmenterConfig = SegmenterConfig()
+    image: ImageConfig = ImageConfig()
+    keyframes: KeyframeConfig = KeyframeConfig()
+    sampling: SamplingConfig = SamplingConfig()
+    map: MapConfig = MapConfig()
+    fusion: FusionConfig = FusionConfig()
+    query: QueryConfig = QueryConfig()
+    input: InputConfig = InputConfig()
+    node: NodeConfig = NodeConfig()
+
+    @classmethod
+    def from_flat(cls, values: Mapping[str, Any]) -> Config:
+        """Build a configuration from dotted keys; missing ones take their default.
+
+        Raises:
+            ConfigError: A key is unknown or a value is of the wrong type or out of range; the message names the key.
+        """
+        nested: dict[str, dict[str, Any]] = {}
+        for key, value in values.items():
+            section, _, name = key.partition(".")
+            if key not in _FIELDS:
+                raise ConfigError(f"unknown parameter '{key}'")
+            nested.setdefault(section, {})[name] = value
+        try:
+            return cls.model_validate(nested)
+        except ValidationError as error:
+            raise ConfigError(_describe(error)) from None
+
+    @classmethod
+    def from_yaml(cls, path: Path) -> Config:
+        """Read a ROS parameter file (``/**: ros__parameters: ...``) or the same tree without these two levels.
+
+        Raises:
+            ConfigError: The file cannot be read or holds something that the schema refuses; the message names both.
+        """
+        try:
+            tree = yaml.safe_load(path.read_text())
+        except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+            raise ConfigError(f"cannot read configuration '{path}': {error}") from None
+        if isinstance(tree, dict) and len(tree) == 1:
+            (inner,) = tree.values()
+            if isinstance(inner, dict) and "ros__parameters" in inner:
+                tree = inner["ros__parameters"]
+        if not isinstance(tree or {}, dict):
+            raise ConfigError(f"configuration '{path}' is not a mapping")
+        try:
+            return cls.from_flat(dict(_flatten(tree or {})))
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+
+    def flat(self) -> dict[str, Any]:
+        """Every value under its dotted key, in the order of the schema."""
+        return dict(_flatten(self.model_dump()))
+
+    def with_values(self, values: Mapping[str, Any]) -> Config:
+        """A copy in which the given dotted keys are replaced.
+
+        Raises:
+            ConfigError: As :meth:`from_flat`.
+        """
+        return Config.from_flat({**self.flat(), **values})
+
+
+def _flatten(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _describe(error: ValidationError) -> str:
+    return "; ".join(
+        f"parameter '{'.'.join(str(part) for part in item['loc'])}': {item['msg']} (got {item['input']!r})"
+        for item in error.errors()
+    )
+
+
+def fields() -> dict[str, FieldInfo]:
+    """The schema's fields (default, description, bounds) under their dotted keys, in order."""
+    return dict(_FIELDS)
+
+
+_FIELDS: dict[str, FieldInfo] = {
+    f"{section}.{name}": field
+    for section, holder in Config.model_fields.items()
+    if isinstance(holder.default, BaseModel)
+    for name, field in type(holder.default).model_fields.items()
+}

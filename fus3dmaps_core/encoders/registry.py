@@ -1,0 +1,51 @@
+"""Encoder trios by name. A new one is a new file or folder and a line here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from types import ModuleType
+from typing import cast
+
+from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
+from fus3dmaps_core.errors import EncoderError
+
+_TRIOS = {
+    "lite": "fus3dmaps_core.encoders.lite",
+}
+
+
+def names() -> list[str]:
+    """Names of the known encoder trios."""
+    return sorted(_TRIOS)
+
+
+def load_trio(name: str, device: str, crop_padding: float) -> EncoderTrio:
+    """Load the three encoders of a trio; its module's ``load_trio(device, crop_padding)`` builds them.
+
+    Args:
+        name: Registry name.
+        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        crop_padding: Padding around a mask's box, as a share of its size.
+
+    Raises:
+        EncoderError: The name is unknown, or its packages or weights are missing or altered.
+    """
+    load = cast(Callable[[str, float], EncoderTrio], _module(name).load_trio)
+    return load(device, crop_padding)
+
+
+def load_text_encoder(name: str, device: str) -> TextEncoder:
+    """Load the text encoder alone, which is all that a query of a saved map needs.
+
+    Raises:
+        EncoderError: As :func:`load_trio`.
+    """
+    load = cast(Callable[[str], TextEncoder], _module(name).load_text_encoder)
+    return load(device)
+
+
+def _module(name: str) -> ModuleType:
+    if name not in _TRIOS:
+        raise EncoderError(f"parameter 'encoder.name': unknown encoder '{name}', known are {', '.join(names())}")
+    return import_module(_TRIOS[name])

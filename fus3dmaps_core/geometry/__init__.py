@@ -1,0 +1,1 @@
+"""Pinhole geometry, keyframe gates and trajectories."""

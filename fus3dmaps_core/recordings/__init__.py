@@ -1,0 +1,1 @@
+"""Reading and writing of rosbag2 MCAP recordings, without ROS."""

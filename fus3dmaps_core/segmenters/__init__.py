@@ -1,0 +1,1 @@
+"""Class-agnostic segmenters: a Protocol, a registry and one module per method."""

@@ -1,0 +1,1 @@
+"""Sources of posed frames: recordings, datasets and simulated scenes."""
