@@ -89,9 +89,7 @@ class FusionConfig(_Section):
     window_radius_m: float = Field(
         0.0, ge=0.0, description="Radius of the sliding window of the dense layer, metres; 0 keeps the whole dense layer."
     )
-    period_frames: int = Field(
-        5, ge=1, description="With a sliding window, fuse after every n-th processed frame."
-    )
+    period_frames: int = Field(5, ge=1, description="With a sliding window, fuse after every n-th processed frame.")
 
 
 class QueryConfig(_Section):

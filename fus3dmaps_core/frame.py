@@ -47,9 +47,7 @@ class Intrinsics:
         """The same camera after its image is resized to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
         # Pixel centres are integers, so it is x + 0.5 that scales.
-        return Intrinsics(
-            self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height
-        )
+        return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height)
 
 
 @dataclass(frozen=True)

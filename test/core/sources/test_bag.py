@@ -1,0 +1,175 @@
+"""Recordings to posed frames: the round trip, odd and damaged recordings, and the counts of what was dropped."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import ros_messages as ros
+from mcap.writer import Writer
+from recorded_frames import PERIOD_NS, START_NS, assert_same_frames, noise_frames
+
+from fus3dmaps_core.config import ImageConfig, InputConfig
+from fus3dmaps_core.errors import RecordingError
+from fus3dmaps_core.frame import PosedFrame
+from fus3dmaps_core.recordings.writer import RecordingWriter
+from fus3dmaps_core.sources.bag import BagSource
+
+S = 1_000_000_000
+
+
+def write(path, frames, config=None):
+    with RecordingWriter(path, config) as writer:
+        for frame in frames:
+            writer.write(frame)
+    return path
+
+
+def write_messages(path, messages):
+    """A recording of (topic, log time, message or raw bytes with their type)."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        channels = {}
+        for topic, log_ns, message in messages:
+            msgtype, data = message if isinstance(message, tuple) else (message.__msgtype__, None)
+            if topic not in channels:
+                definition, _ = ros.TYPESTORE.generate_msgdef(msgtype, ros_version=2)
+                schema = writer.register_schema(msgtype, "ros2msg", definition.encode())
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            data = data or bytes(ros.TYPESTORE.serialize_cdr(message, msgtype))
+            writer.add_message(channels[topic], log_ns, data, log_ns)
+        writer.finish()
+    return path
+
+
+def complete(stamp_ns):
+    return [
+        ("/rgb/camera_info", stamp_ns, ros.camera_info(stamp_ns)),
+        ("/pose", stamp_ns, ros.pose(stamp_ns)),
+        ("/depth/image", stamp_ns, ros.image(stamp_ns, "16UC1")),
+        ("/rgb/image", stamp_ns, ros.image(stamp_ns)),
+    ]
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return noise_frames(20)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory, frames):
+    return write(tmp_path_factory.mktemp("recording") / "bag.mcap", frames)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        InputConfig(),
+        InputConfig(rgb_topic="/camera/color", map_frame="world", T_body_camera=[0.1, 0.2, 0.3, 0.5, -0.5, 0.5, -0.5]),
+    ],
+)
+def test_frames_survive_the_round_trip(tmp_path, frames, config):
+    with BagSource(write(tmp_path / "bag.mcap", frames[:5], config), config) as source:
+        assert len(source) == 5
+        assert source.messages_total == 20
+        assert source.duration_s == pytest.approx(0.4)
+        for _ in range(2):  # Each iteration starts anew.
+            assert_same_frames([paired.decode(ImageConfig()) for paired in source], frames[:5])
+            assert source.messages_read == 20
+            assert not source.pairer.drops
+            assert source.pairer.received["pose" if config.pose_topic == "pose" else config.pose_topic] == 5
+
+
+def test_frames_come_while_reading(recording):
+    with BagSource(recording, InputConfig()) as source:
+        next(iter(source))
+        assert source.messages_read == 4
+
+
+@pytest.mark.parametrize("share", [0.55, 0.8, 0.9999])
+def test_a_truncated_recording_delivers_its_readable_frames_then_an_error(recording, frames, tmp_path, share):
+    data = recording.read_bytes()
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[: int(len(data) * share)])
+    delivered: list[PosedFrame] = []
+    with BagSource(path, InputConfig()) as source:
+        with pytest.raises(RecordingError, match=r"cut\.mcap' is truncated.*\d+ messages were readable"):
+            delivered.extend(paired.decode(ImageConfig()) for paired in source)
+        assert len(source) >= len(delivered) > 0
+    assert_same_frames(delivered, frames[: len(delivered)])
+
+
+def test_what_is_no_recording_is_refused(tmp_path):
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    for name in ("empty.mcap", "missing.mcap"):
+        with pytest.raises(RecordingError, match=name):
+            BagSource(tmp_path / name, InputConfig())
+
+
+@pytest.mark.parametrize("parameter", ["rgb_topic", "depth_topic", "camera_info_topic", "pose_topic"])
+def test_a_missing_topic_is_named_with_what_there_is(recording, parameter):
+    with pytest.raises(RecordingError) as caught:
+        BagSource(recording, InputConfig(**{parameter: "elsewhere/topic"}))
+    text = str(caught.value)
+    assert "no topic '/elsewhere/topic'" in text
+    assert f"input.{parameter}" in text
+    assert "/rgb/image (sensor_msgs/msg/Image, 20 messages)" in text
+    assert "/pose (geometry_msgs/msg/PoseStamped, 20 messages)" in text
+
+
+def test_a_topic_of_another_type_is_named(recording):
+    with pytest.raises(RecordingError, match=r"holds geometry_msgs/msg/PoseStamped on topic '/pose', not sensor_msgs"):
+        BagSource(recording, InputConfig(depth_topic="pose"))
+    with pytest.raises(RecordingError, match=r"no topic '/odom' \(parameter 'input\.odometry_topic'\)"):
+        BagSource(recording, InputConfig(pose_source="odometry"))
+
+
+def test_odometry_recordings(tmp_path):
+    messages = [message for stamp_ns in (S, 2 * S) for message in complete(stamp_ns) if message[0] != "/pose"]
+    messages += [("/odom", i * S // 4, ros.odometry(i * S // 4, (i / 4, 0.0, 0.0), frame_id="odom")) for i in range(12)]
+    path = write_messages(tmp_path / "bag.mcap", messages)
+    with BagSource(path, InputConfig(pose_source="odometry", map_frame="odom")) as source:
+        assert [paired.T_world_camera[0, 3] for paired in source] == [1.0, 2.0]
+
+
+def test_messages_come_in_order_of_recording_not_of_the_file(tmp_path):
+    messages = [message for stamp_ns in (S, 2 * S, 3 * S) for message in complete(stamp_ns)]
+    path = write_messages(tmp_path / "bag.mcap", sorted(messages, key=lambda message: message[0]))
+    with BagSource(path, InputConfig()) as source:
+        assert [paired.stamp_ns for paired in source] == [S, 2 * S, 3 * S]
+
+
+def test_bad_messages_are_dropped_and_counted_and_the_rest_is_delivered(tmp_path):
+    second = START_NS + PERIOD_NS
+    messages = [
+        *complete(START_NS),
+        ("/rgb/image", START_NS + 1, ("sensor_msgs/msg/Image", b"\x00\x01\x00\x00\x01\x02")),
+        ("/rgb/image", START_NS + 2, ros.image(START_NS + 2, "yuv422")),
+        ("/depth/image", START_NS + 3, ros.image(START_NS + 3, "16UC1", data=np.zeros(3, np.uint8))),
+        ("/pose", START_NS + 4, ros.pose(START_NS + 4, (float("nan"), 0.0, 0.0))),
+        ("/rgb/image", START_NS + 5, ros.image(START_NS - 5)),
+        *complete(second),
+    ]
+    with BagSource(write_messages(tmp_path / "bag.mcap", messages), InputConfig()) as source:
+        assert [paired.stamp_ns for paired in source] == [START_NS, second]
+        assert source.pairer.drops == {
+            "bad_message": 1,
+            "unknown_encoding": 1,
+            "size_mismatch": 1,
+            "bad_pose": 1,
+            "stamp_backwards": 1,
+        }
+        assert "/rgb/image" in source.pairer.last_drop["bad_message"]
+
+
+def test_images_at_the_end_are_settled(tmp_path):
+    messages = [
+        *complete(START_NS),
+        ("/depth/image", START_NS + 1, ros.image(START_NS + PERIOD_NS - 5_000_000, "16UC1")),
+        ("/pose", START_NS + 2, ros.pose(START_NS + PERIOD_NS)),
+        ("/rgb/image", START_NS + 3, ros.image(START_NS + PERIOD_NS)),
+        ("/rgb/image", START_NS + 4, ros.image(START_NS + 2 * PERIOD_NS)),
+    ]
+    with BagSource(write_messages(tmp_path / "bag.mcap", messages), InputConfig()) as source:
+        assert [paired.stamp_ns for paired in source] == [START_NS, START_NS + PERIOD_NS]
+        assert source.pairer.drops == {"no_depth": 1}

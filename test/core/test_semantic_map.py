@@ -1,0 +1,393 @@
+"""The map against the plain reference over whole random sequences, and what it refuses."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+
+import numpy as np
+import pytest
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.query import TextQuery
+from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+from reference.agreement import KnownTexts, apply_to_both, assert_same_answer, assert_same_map, engine_of, reference_of
+from reference.steps import (
+    DenseStep,
+    FuseStep,
+    ProposalStep,
+    Setting,
+    dense_step,
+    embeddings_of,
+    proposal_step,
+    random_box,
+    random_steps,
+    sequences,
+)
+
+
+def ask_everything(engine, reference, setting: Setting, seed: int) -> None:
+    """Every layer, with and without negatives and thresholds."""
+    rng = np.random.default_rng(seed)
+    names = ["lamp", "mug", "floor", "wall"]
+    texts = KnownTexts(dict(zip(names, embeddings_of(4, setting.dimension, rng), strict=True)))
+    for layer, negatives in itertools.product(LAYERS, [(), ("floor", "wall")]):
+        threshold = None if rng.random() < 0.5 else float(rng.uniform(0.2, 0.8))
+        query = TextQuery(
+            prompts=names[: int(rng.integers(1, 3))],
+            negative_prompts=negatives,
+            layer=layer,
+            threshold=threshold,
+            top_k=int(rng.integers(1, 6)),
+            min_voxels=int(rng.integers(1, 4)),
+        )
+        assert_same_answer(engine, reference, setting, query, texts, logit_scale=10.0)
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float16"])
+def test_agrees_with_the_reference_after_every_step(dtype: str):
+    @settings(max_examples=60)
+    @given(sequences(dtype), st.integers(0, 1000))
+    def check(sequence, seed):
+        setting, steps = sequence
+        engine, reference = engine_of(setting), reference_of(setting)
+        for step in steps:
+            apply_to_both(step, engine, reference)
+            assert_same_map(engine, reference, setting)
+        ask_everything(engine, reference, setting, seed)
+        assert_same_map(engine, reference, setting)
+        for branch in reference.seen:
+            event(branch)
+
+    check()
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        Setting(),
+        Setting(window_radius_m=0.16, variance_ratio=5.0),
+        Setting(max_hypotheses=1, window_radius_m=0.12, voxel_size_m=0.07),
+        Setting(max_hypotheses=2, iou_threshold=0.5, variance_ratio=0.25, dtype="float16", window_radius_m=0.16),
+    ],
+    ids=["full", "window", "one-hypothesis", "half-precision"],
+)
+def test_agrees_with_the_reference_over_a_long_walk_that_takes_every_branch(setting: Setting):
+    engine, reference = engine_of(setting), reference_of(setting)
+    for number, step in enumerate(random_steps(setting, extent=3, count=120, seed=8)):
+        apply_to_both(step, engine, reference)
+        if number % 4 == 3:
+            assert_same_map(engine, reference, setting)
+        if number % 40 == 39:
+            ask_everything(engine, reference, setting, number)
+    often = {"dense_new", "dense_again", "instance_new", "instance_match", "overlap_too_small"}
+    often |= {"hypothesis_pruned", "instance_deleted", "fusion_replaced", "dense_weightless"}
+    sometimes = {"match_tie", "proposal_without_point"}
+    if setting.window_radius_m > 0:
+        often |= {"window_dropped", "dense_revisit", "fusion_kept"}
+    if setting.max_hypotheses > 1:
+        often.add("hypothesis_pruned_tie")
+    assert {branch: reference.seen[branch] for branch in often if reference.seen[branch] < 10} == {}
+    assert {branch: reference.seen[branch] for branch in sometimes if reference.seen[branch] < 3} == {}
+
+
+def test_agrees_with_the_reference_when_storage_grows_past_its_first_blocks():
+    setting = Setting(dimension=3, window_radius_m=0.45)
+    rng = np.random.default_rng(2)
+    engine, reference = engine_of(setting), reference_of(setting)
+    for offset in (0, 12, 24):
+        keys = [(x + offset, y - 7, z - 9) for x, y, z in np.ndindex(17, 15, 18)]
+        apply_to_both(dense_step(keys, setting, rng, weightless=False), engine, reference)
+        apply_to_both(proposal_step([keys[: 1 + len(keys) // 3]], setting, rng), engine, reference)
+        assert engine.prune_window(np.array([offset * 0.05, 0.0, 0.0])) == reference.prune_window(
+            np.array([offset * 0.05, 0.0, 0.0])
+        )
+        apply_to_both(FuseStep(), engine, reference)
+    assert reference.seen["window_dropped"] > 4096
+    assert_same_map(engine, reference, setting)
+    texts = KnownTexts({"mug": np.array([0.2, 0.9, -0.1])})
+    assert_same_answer(engine, reference, setting, TextQuery(["mug"], layer="fused_dense"), texts, logit_scale=1.0)
+
+
+@settings(max_examples=15)
+@given(sequences(max_steps=8))
+def test_the_same_sequence_gives_the_same_bytes(sequence):
+    setting, steps = sequence
+    first, second = engine_of(setting), engine_of(setting)
+    for step in steps:
+        step.apply(first)
+        step.apply(second)
+    assert_same_bytes(first.export_state(), second.export_state())
+
+
+def test_reset_gives_a_map_like_a_new_one():
+    setting = Setting(window_radius_m=0.16)
+    used, fresh = engine_of(setting), engine_of(setting)
+    for step in random_steps(setting, extent=3, count=30, seed=1):
+        step.apply(used)
+    used.reset()
+    assert_same_bytes(used.export_state(), fresh.export_state())
+    for step in random_steps(setting, extent=3, count=30, seed=2):
+        step.apply(used)
+        step.apply(fresh)
+    assert_same_bytes(used.export_state(), fresh.export_state())
+
+
+def test_an_id_is_never_given_twice():
+    setting = Setting(max_hypotheses=1)
+    engine = engine_of(setting)
+    rng = np.random.default_rng(4)
+    born: list[int] = []
+    alive: set[int] = set()
+    for _ in range(150):
+        ids = proposal_step([random_box(3, rng)], setting, rng).apply(engine).tolist()
+        born += [each for each in ids if each not in alive]
+        alive = set(engine.instances().ids.tolist())
+    assert len(born) > len(alive) + 20, "too few instances died for this to mean anything"
+    assert len(set(born)) == len(born)
+    assert born == sorted(born)
+
+
+def test_without_a_window_nothing_is_pruned():
+    setting = Setting()
+    engine = engine_of(setting)
+    dense_step([(0, 0, 0), (5, 5, 5)], setting, np.random.default_rng(0), weightless=False).apply(engine)
+    before = engine.export_state()
+    assert engine.prune_window(np.array([1e3, 0.0, 0.0])) == 0
+    assert_same_bytes(engine.export_state(), before)
+
+
+def test_the_window_drops_what_is_farther_and_keeps_the_rest():
+    setting = Setting(voxel_size_m=0.5, window_radius_m=1.0)
+    engine = engine_of(setting)
+    rng = np.random.default_rng(0)
+    dense_step([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], setting, rng, weightless=False).apply(engine)
+    # Centres lie at 0.25, 0.75, 1.25 and 1.75 along x; the third is exactly one radius away and so is not farther.
+    assert engine.prune_window(np.array([0.25, 0.25, 0.25])) == 1
+    assert engine.dense_voxel_count == 3
+    assert engine.voxel_count == 4
+    assert engine.prune_window(np.array([0.25, 0.25, 0.25])) == 0
+
+
+def test_points_belong_to_their_voxel_kilometres_away_and_at_its_walls():
+    engine = engine_of(Setting(voxel_size_m=0.05))
+    keys = np.array([[-1_000_000, -1_000_000, 1_000_000], [-1, 0, -2], [0, 0, 0], [400_000, -400_000, 3]])
+    inside = np.array([0.01, 0.99, 0.5])
+    engine.integrate_dense(
+        (keys + inside) * 0.05, np.zeros(4, int), np.ones((1, 5)), np.ones(1), np.zeros((4, 3), np.uint8)
+    )
+    assert sorted(engine.export_state()["voxel_coordinates"].tolist()) == keys.tolist()
+
+    # Half a metre is a power of two: points on the wall itself belong to the voxel above it, also below zero.
+    engine = engine_of(Setting(voxel_size_m=0.5))
+    ids = engine.integrate_proposals(
+        np.array([[0.5, -0.5, 0.0], [-0.0, 1.0, -1.0]]), np.zeros(2, int), np.ones((1, 5))
+    )
+    assert ids.tolist() == [0]
+    assert sorted(engine.export_state()["voxel_coordinates"].tolist()) == [[0, 2, -2], [1, -1, 0]]
+
+
+def test_frames_without_points_change_nothing():
+    setting = Setting()
+    engine = engine_of(setting)
+    for step in random_steps(setting, extent=2, count=10, seed=3):
+        step.apply(engine)
+    before = engine.export_state()
+    none = np.zeros((0, 3))
+    engine.integrate_dense(none, np.zeros(0, int), np.ones((4, 5)), np.ones(4), np.zeros((0, 3), np.uint8))
+    engine.integrate_dense(none, np.zeros(0, int), np.zeros((0, 5)), np.zeros(0), np.zeros((0, 3), np.uint8))
+    assert engine.integrate_proposals(none, np.zeros(0, int), np.ones((2, 5))).tolist() == [-1, -1]
+    assert engine.integrate_proposals(none, np.zeros(0, int), np.zeros((0, 5))).tolist() == []
+    assert_same_bytes(engine.export_state(), before)
+
+
+def test_an_empty_map_can_be_fused_pruned_and_looked_at():
+    engine = engine_of(Setting(window_radius_m=1.0))
+    report = engine.fuse()
+    assert (report.instances, report.updated, report.voxels) == (0, 0, 0)
+    assert engine.prune_window(np.zeros(3)) == 0
+    assert engine.voxels().centers_m.shape == (0, 3)
+    assert engine.instances().ids.shape == (0,)
+
+
+@settings(max_examples=25)
+@given(sequences(max_steps=8))
+def test_full_fusion_forgets_what_it_stored_before(sequence):
+    """Stateless: fusing along the way makes no difference to fusing once at the end."""
+    setting, steps = sequence
+    setting = Setting(**{**setting.__dict__, "window_radius_m": 0.0})
+    once, often = engine_of(setting), engine_of(setting)
+    for step in steps:
+        if not isinstance(step, FuseStep):
+            step.apply(once)
+        step.apply(often)
+        often.fuse()
+    once.fuse()
+    often.fuse()
+    assert_same_bytes(once.export_state(), often.export_state())
+
+
+def test_readers_see_whole_frames_while_mapping_goes_on():
+    """Every frame adds the same number of points to both voxels, so a reader that sees them differ saw half a frame."""
+    engine = SemanticMap(4, MapConfig(), 1.0)
+    points = np.array([[0.01, 0.01, 0.01]] * 3 + [[1.01, 0.01, 0.01]] * 3)
+    failures: list[str] = []
+    stop = threading.Event()
+
+    def read() -> None:
+        while not stop.is_set():
+            weights = engine.voxels().dense_weight
+            state = engine.export_state()
+            if len(set(weights.tolist())) > 1 or len(set(state["dense_weight"].tolist())) > 1:
+                failures.append(f"half a frame: {weights} {state['dense_weight']}")
+            if len(state["voxel_coordinates"]) != len(state["hypothesis_id"]):
+                failures.append("columns of different lengths")
+
+    readers = [threading.Thread(target=read) for _ in range(2)]
+    for reader in readers:
+        reader.start()
+    try:
+        for _ in range(60):
+            engine.integrate_dense(points, np.zeros(6, int), np.ones((1, 4)), np.ones(1), np.zeros((6, 3), np.uint8))
+            engine.integrate_proposals(points, np.zeros(6, int), np.ones((1, 4)))
+            engine.fuse()
+    finally:
+        stop.set()
+        for reader in readers:
+            reader.join()
+    assert failures == []
+    assert engine.voxels().dense_weight.tolist() == [180.0, 180.0]
+
+
+# ---- refusals
+
+DENSE = {
+    "points_m": np.array([[0.01, 0.02, 0.03], [9.0, 9.0, 9.0]]),
+    "patches": np.array([0, 1]),
+    "embeddings": np.ones((2, 5), np.float32),
+    "weights": np.array([1.0, 0.5], np.float32),
+    "colors": np.zeros((2, 3), np.uint8),
+}
+PROPOSALS = {name: DENSE[name] for name in ("points_m", "embeddings")} | {"proposals": np.array([0, 1])}
+
+
+def changed(array: np.ndarray, index, value) -> np.ndarray:
+    copy = array.copy()
+    copy[index] = value
+    return copy
+
+
+BAD_POINTS = {
+    "points of two coordinates": DENSE["points_m"][:, :2],
+    "points without rows": DENSE["points_m"][0],
+    "a point at NaN": changed(DENSE["points_m"], (1, 2), np.nan),
+    "a point at infinity": changed(DENSE["points_m"], (1, 0), np.inf),
+    "a point at minus infinity": changed(DENSE["points_m"], (0, 0), -np.inf),
+    "a point beyond the grid": changed(DENSE["points_m"], (1, 1), 0.05 * 2**20),
+    "a point below the grid": changed(DENSE["points_m"], (1, 1), -0.05 * 2**20 - 0.1),
+    "a point at 1e300": changed(DENSE["points_m"], (1, 1), 1e300),
+    "more points than patches": np.concatenate([DENSE["points_m"]] * 2),
+    "points of text": np.array([["a", "b", "c"], ["d", "e", "f"]]),
+}
+BAD_INDICES = {
+    "an index beyond the rows": np.array([0, 2]),
+    "a negative index": np.array([0, -1]),
+    "indices of two axes": np.zeros((2, 1), int),
+    "indices that are not integers": np.array([0.0, 1.0]),
+    "too few indices": np.array([0]),
+}
+BAD_EMBEDDINGS = {
+    "an embedding with NaN": changed(DENSE["embeddings"], (1, 3), np.nan),
+    "an embedding with infinity": changed(DENSE["embeddings"], (0, 0), np.inf),
+    "an embedding of length 0": changed(DENSE["embeddings"], 1, 0.0),
+    "wider embeddings": np.ones((2, 6), np.float32),
+    "narrower embeddings": np.ones((2, 4), np.float32),
+    "one embedding as a vector": np.ones(5, np.float32),
+    "embeddings of three axes": np.ones((2, 5, 1), np.float32),
+}
+BAD_WEIGHTS = {
+    "a negative weight": np.array([1.0, -0.25]),
+    "a weight of NaN": np.array([1.0, np.nan]),
+    "an infinite weight": np.array([np.inf, 1.0]),
+    "too few weights": np.array([1.0]),
+    "too many weights": np.ones(3),
+    "weights of two axes": np.ones((2, 1)),
+}
+BAD_COLORS = {
+    "colours of floats": np.zeros((2, 3), np.float32),
+    "colours with alpha": np.zeros((2, 4), np.uint8),
+    "too few colours": np.zeros((1, 3), np.uint8),
+}
+
+
+def cases(**bad: dict[str, np.ndarray]):
+    return [pytest.param(field, value, id=name) for field, values in bad.items() for name, value in values.items()]
+
+
+def used_map() -> SemanticMap:
+    setting = Setting(window_radius_m=0.16)
+    engine = engine_of(setting)
+    for step in random_steps(setting, extent=2, count=12, seed=5):
+        step.apply(engine)
+    return engine
+
+
+def assert_same_bytes(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
+    assert first.keys() == second.keys()
+    for name, array in first.items():
+        assert array.dtype == second[name].dtype, name
+        assert array.shape == second[name].shape, name
+        assert array.tobytes() == second[name].tobytes(), name
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    cases(points_m=BAD_POINTS, patches=BAD_INDICES, embeddings=BAD_EMBEDDINGS, weights=BAD_WEIGHTS, colors=BAD_COLORS),
+)
+def test_bad_dense_input_is_refused_and_changes_nothing(field: str, value: np.ndarray):
+    engine = used_map()
+    before = engine.export_state()
+    with pytest.raises(MapError):
+        engine.integrate_dense(**{**DENSE, field: value})
+    assert_same_bytes(engine.export_state(), before)
+    DenseStep(**DENSE).apply(engine)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), cases(points_m=BAD_POINTS, proposals=BAD_INDICES, embeddings=BAD_EMBEDDINGS)
+)
+def test_bad_proposals_are_refused_and_change_nothing(field: str, value: np.ndarray):
+    engine = used_map()
+    before = engine.export_state()
+    with pytest.raises(MapError):
+        engine.integrate_proposals(**{**PROPOSALS, field: value})
+    assert_same_bytes(engine.export_state(), before)
+    ProposalStep(**PROPOSALS).apply(engine)
+
+
+@pytest.mark.parametrize("center", [np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0]), np.zeros((1, 3)), np.array([np.inf, 0, 0])])
+def test_a_bad_window_centre_is_refused_and_changes_nothing(center: np.ndarray):
+    engine = used_map()
+    before = engine.export_state()
+    with pytest.raises(MapError):
+        engine.prune_window(center)
+    assert_same_bytes(engine.export_state(), before)
+
+
+def test_what_is_handed_in_stays_as_it_was_and_what_is_handed_out_is_a_copy():
+    engine = used_map()
+    arguments = {name: array.copy() for name, array in DENSE.items()}
+    engine.integrate_dense(**arguments)
+    for name, array in arguments.items():
+        np.testing.assert_array_equal(array, DENSE[name])
+        if array.dtype != np.int64:
+            array[...] = 77
+    state = engine.export_state()
+    for array in engine.export_state().values():
+        array[...] = 0
+    for snapshot in (engine.voxels(), engine.instances()):
+        for array in vars(snapshot).values():
+            array[...] = 0
+    assert_same_bytes(engine.export_state(), state)

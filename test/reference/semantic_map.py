@@ -1,0 +1,210 @@
+"""The map of the method in dictionaries: dense layer, instance layer, fusion, sliding window."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from reference.vectors import Key, Vector, center_of, unit, voxel_of
+
+
+@dataclass
+class Instance:
+    """Embedding f_id and weight w_id, and what fusion last stored for it."""
+
+    embedding: Vector
+    weight: int
+    fused_embedding: Vector | None = None
+    evidence: float = 0.0
+
+
+@dataclass
+class ReferenceMap:
+    """Every quantity of the method under its own name, updated one point, voxel or instance at a time.
+
+    ``seen`` counts the branches that were taken, so that a test can tell whether its sequence reached them;
+    ``most_dense_updates`` is the largest number of frames behind one dense mean, each of which may round it once.
+    """
+
+    voxel_size_m: float
+    max_hypotheses: int
+    iou_threshold: float
+    variance_ratio: float
+    window_radius_m: float = 0.0
+    next_id: int = 0
+    voxels: set[Key] = field(default_factory=set)
+    color: dict[Key, Vector] = field(default_factory=dict)
+    dense_weight: dict[Key, float] = field(default_factory=dict)
+    dense_mean: dict[Key, Vector] = field(default_factory=dict)
+    dense_updates: Counter[Key] = field(default_factory=Counter)
+    most_dense_updates: int = 0
+    hypotheses: dict[Key, dict[int, int]] = field(default_factory=dict)
+    instances: dict[int, Instance] = field(default_factory=dict)
+    dropped_keys: set[Key] = field(default_factory=set)
+    seen: Counter[str] = field(default_factory=Counter)
+
+    # ---- dense layer
+
+    def integrate_dense(self, points_m, patches, embeddings, weights, colors) -> None:
+        """One keyframe's points; ``patches`` says whose embedding and weight each point carries."""
+        arrived_weight: dict[Key, float] = {}
+        arrived_sum: dict[Key, Vector] = {}
+        arrived_colors: dict[Key, list[Vector]] = {}
+        for point, patch, color in zip(points_m, patches, colors, strict=True):
+            key = voxel_of(point, self.voxel_size_m)
+            self.voxels.add(key)
+            arrived_colors.setdefault(key, []).append(np.asarray(color, dtype=np.float64))
+            weight = float(weights[patch])
+            arrived_weight[key] = arrived_weight.get(key, 0.0) + weight
+            arrived_sum[key] = arrived_sum.get(key, 0.0) + weight * unit(embeddings[patch])
+        for key, colors_of_voxel in arrived_colors.items():
+            self.color[key] = sum(colors_of_voxel) / len(colors_of_voxel)
+        for key, weight in arrived_weight.items():
+            if weight == 0.0:
+                self.seen["dense_weightless"] += 1
+                continue
+            self.seen["dense_new" if key not in self.dense_weight else "dense_again"] += 1
+            if key in self.dropped_keys and key not in self.dense_weight:
+                self.seen["dense_revisit"] += 1
+            old = self.dense_weight.get(key, 0.0)
+            mean = self.dense_mean.get(key, np.zeros_like(arrived_sum[key]))
+            self.dense_mean[key] = (old * mean + arrived_sum[key]) / (old + weight)
+            self.dense_weight[key] = old + weight
+            self.dense_updates[key] += 1
+            self.most_dense_updates = max(self.most_dense_updates, self.dense_updates[key])
+
+    # ---- instance layer
+
+    def voxels_of(self, instance_id: int) -> set[Key]:
+        """V_id: the voxels that hold the instance as a hypothesis."""
+        return {key for key, counts in self.hypotheses.items() if instance_id in counts}
+
+    def top_of(self, key: Key) -> int | None:
+        """The hypothesis of a voxel with the highest count; of equal ones the lowest id."""
+        counts = self.hypotheses.get(key, {})
+        return min(counts, key=lambda each: (-counts[each], each)) if counts else None
+
+    def integrate_proposals(self, points_m, proposals, embeddings) -> list[int]:
+        """One keyframe's proposals in row order; the id each was given, -1 for one without points."""
+        ids = []
+        for m, embedding in enumerate(embeddings):
+            hits: Counter[Key] = Counter()
+            for point, proposal in zip(points_m, proposals, strict=True):
+                if proposal == m:
+                    hits[voxel_of(point, self.voxel_size_m)] += 1
+            if not hits:
+                self.seen["proposal_without_point"] += 1
+                ids.append(-1)
+                continue
+            ids.append(self._integrate_proposal(hits, unit(embedding)))
+        return ids
+
+    def _integrate_proposal(self, hits: Counter[Key], embedding: Vector) -> int:
+        points = sum(hits.values())
+        instance_id = self._associate(set(hits))
+        if instance_id is None:
+            self.seen["instance_new"] += 1
+            instance_id = self.next_id
+            self.next_id += 1
+            self.instances[instance_id] = Instance(embedding, points)
+        else:
+            self.seen["instance_match"] += 1
+            instance = self.instances[instance_id]
+            total = instance.weight + points
+            instance.embedding = (instance.weight * instance.embedding + points * embedding) / total
+            instance.weight = total
+        for key in sorted(hits):
+            self.voxels.add(key)
+            counts = self.hypotheses.setdefault(key, {})
+            if instance_id not in counts and len(counts) == self.max_hypotheses:
+                self.seen["hypothesis_pruned"] += 1
+                lowest = min(counts.values())
+                if sum(count == lowest for count in counts.values()) > 1:
+                    self.seen["hypothesis_pruned_tie"] += 1
+                del counts[min(other for other, count in counts.items() if count == lowest)]
+            counts[instance_id] = counts.get(instance_id, 0) + hits[key]
+        for other in [each for each in self.instances if not self.voxels_of(each)]:
+            self.seen["instance_deleted"] += 1
+            del self.instances[other]
+        return instance_id
+
+    def _associate(self, voxels: set[Key]) -> int | None:
+        overlap: dict[int, float] = {}
+        for instance_id in sorted({each for key in voxels for each in self.hypotheses.get(key, {})}):
+            members = self.voxels_of(instance_id)
+            overlap[instance_id] = len(voxels & members) / len(voxels | members)
+        if not overlap:
+            return None
+        best = max(overlap.values())
+        winners = [each for each, value in overlap.items() if value == best]
+        if len(winners) > 1:
+            self.seen["match_tie"] += 1
+        if not best > self.iou_threshold:
+            self.seen["overlap_too_small"] += 1
+            return None
+        return min(winners)
+
+    # ---- cross-layer fusion
+
+    def fused_instance(self, instance_id: int) -> tuple[Vector, float]:
+        """f_fused,id and e_id from the map as it is."""
+        embedding = self.instances[instance_id].embedding
+        total, evidence = np.zeros_like(embedding), 0.0
+        for key in sorted(self.voxels_of(instance_id)):
+            weight = self.dense_weight.get(key, 0.0)
+            support = self.variance_ratio * self.hypotheses[key][instance_id]
+            rho = weight + support
+            f_voxel = (weight * self.dense_mean.get(key, np.zeros_like(embedding)) + support * embedding) / rho
+            total = total + rho * f_voxel
+            evidence += rho
+        return total / evidence, evidence
+
+    def fused_dense(self, key: Key) -> Vector | None:
+        """Fused embedding of a voxel; None where neither layer knows anything."""
+        top = self.top_of(key)
+        if top is None:
+            return self.dense_mean.get(key)
+        if key not in self.dense_weight:
+            return self.instances[top].embedding
+        weight, support = self.dense_weight[key], self.variance_ratio * self.hypotheses[key][top]
+        return (weight * self.dense_mean[key] + support * self.instances[top].embedding) / (weight + support)
+
+    def fuse(self) -> int:
+        """Store fusion of every instance; with a window only where evidence grew. Returns how many were stored."""
+        updated = 0
+        for instance_id, instance in self.instances.items():
+            fused, evidence = self.fused_instance(instance_id)
+            if self.window_radius_m > 0 and not evidence > instance.evidence:
+                self.seen["fusion_kept"] += 1
+                continue
+            self.seen["fusion_replaced"] += 1
+            instance.fused_embedding, instance.evidence = fused, evidence
+            updated += 1
+        return updated
+
+    def query_embedding(self, instance_id: int) -> Vector:
+        """What layer fused_instances answers with: fresh without a window, what was stored with one."""
+        instance = self.instances[instance_id]
+        if self.window_radius_m == 0:
+            return self.fused_instance(instance_id)[0]
+        return instance.embedding if instance.fused_embedding is None else instance.fused_embedding
+
+    # ---- sliding window
+
+    def prune_window(self, center_m: Vector) -> int:
+        """Forget the dense layer farther than the radius from the camera; returns how many voxels lost it."""
+        if self.window_radius_m == 0:
+            return 0
+        far = [
+            key
+            for key in self.dense_weight
+            if math.dist(center_of(key, self.voxel_size_m), center_m) > self.window_radius_m
+        ]
+        for key in far:
+            del self.dense_weight[key], self.dense_mean[key], self.dense_updates[key]
+            self.dropped_keys.add(key)
+        self.seen["window_dropped"] += len(far)
+        return len(far)

@@ -1,0 +1,187 @@
+"""Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, fusions.
+
+A step applies to the reference and to the package's map alike, for both have the same methods. Points lie inside their voxel,
+away from its walls, and dense weights are multiples of 1/64, so that sums are exact and comparisons of evidence have one answer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from reference.vectors import Key
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How a map is built."""
+
+    voxel_size_m: float = 0.05
+    max_hypotheses: int = 3
+    iou_threshold: float = 0.2
+    variance_ratio: float = 1.0
+    window_radius_m: float = 0.0
+    dimension: int = 5
+    dtype: str = "float32"
+
+
+@dataclass(frozen=True)
+class DenseStep:
+    """Arguments of integrate_dense."""
+
+    points_m: np.ndarray
+    patches: np.ndarray
+    embeddings: np.ndarray
+    weights: np.ndarray
+    colors: np.ndarray
+
+    def apply(self, target: Any) -> Any:
+        return target.integrate_dense(self.points_m, self.patches, self.embeddings, self.weights, self.colors)
+
+
+@dataclass(frozen=True)
+class ProposalStep:
+    """Arguments of integrate_proposals."""
+
+    points_m: np.ndarray
+    proposals: np.ndarray
+    embeddings: np.ndarray
+
+    def apply(self, target: Any) -> Any:
+        return target.integrate_proposals(self.points_m, self.proposals, self.embeddings)
+
+
+@dataclass(frozen=True)
+class WindowStep:
+    """Argument of prune_window."""
+
+    center_m: np.ndarray
+
+    def apply(self, target: Any) -> Any:
+        return target.prune_window(self.center_m)
+
+
+@dataclass(frozen=True)
+class FuseStep:
+    """A fusion."""
+
+    def apply(self, target: Any) -> Any:
+        report = target.fuse()
+        return getattr(report, "updated", report)
+
+
+Step = DenseStep | ProposalStep | WindowStep | FuseStep
+
+
+def points_in(keys: np.ndarray, voxel_size_m: float, rng: np.random.Generator) -> np.ndarray:
+    """One point somewhere inside each voxel (n, 3)."""
+    return (np.asarray(keys, dtype=np.float64).reshape(-1, 3) + rng.uniform(0.05, 0.95, (len(keys), 3))) * voxel_size_m
+
+
+def embeddings_of(count: int, dimension: int, rng: np.random.Generator) -> np.ndarray:
+    """Vectors of any length that share enough direction for their means to keep one."""
+    directions = rng.normal(size=(count, dimension)) + 0.8
+    return (directions * rng.uniform(0.05, 20.0, (count, 1))).astype(np.float32)
+
+
+def dense_step(keys: list[Key], setting: Setting, rng: np.random.Generator, weightless: bool = True) -> DenseStep:
+    """A frame with a point in each of the voxels, which may repeat; more patches than are hit, some without weight."""
+    patch_count = int(rng.integers(1, 6))
+    weights = rng.integers(0 if weightless else 1, 65, patch_count) / 64.0
+    weights[rng.random(patch_count) < 0.4] = 1.0
+    if weightless:
+        weights[rng.random(patch_count) < 0.1] = 0.0
+    return DenseStep(
+        points_in(np.array(keys).reshape(-1, 3), setting.voxel_size_m, rng),
+        rng.integers(0, patch_count, len(keys)),
+        embeddings_of(patch_count, setting.dimension, rng),
+        weights.astype(np.float32),
+        rng.integers(0, 256, (len(keys), 3), dtype=np.uint8),
+    )
+
+
+def proposal_step(masks: list[list[Key]], setting: Setting, rng: np.random.Generator) -> ProposalStep:
+    """A frame of proposals, each with a point in each of its voxels, which may repeat; points come in mixed order."""
+    keys = [key for mask in masks for key in mask]
+    proposals = np.array([m for m, mask in enumerate(masks) for _ in mask], dtype=np.int64)
+    order = rng.permutation(len(keys))
+    return ProposalStep(
+        points_in(np.array(keys).reshape(-1, 3), setting.voxel_size_m, rng)[order],
+        proposals[order],
+        embeddings_of(len(masks), setting.dimension, rng),
+    )
+
+
+def random_box(extent: int, rng: np.random.Generator) -> list[Key]:
+    """Voxels of a random box in [-extent, extent)^3, with holes and repetitions."""
+    low = rng.integers(-extent, extent, 3)
+    high = np.minimum(low + rng.integers(1, rng.integers(2, 2 * extent + 2), 3), extent)
+    keys = [tuple(int(each) for each in low + offset) for offset in np.ndindex(*(high - low))]
+    kept = [key for key in keys if rng.random() < 0.85] or keys[:1]
+    again = [kept[int(each)] for each in rng.integers(0, len(kept), rng.integers(0, len(kept) + 1))]
+    return kept + again
+
+
+def random_steps(setting: Setting, extent: int, count: int, seed: int) -> list[Step]:
+    """A long walk through one place, so that objects are seen again, crowd each other out and leave the window."""
+    rng = np.random.default_rng(seed)
+    steps: list[Step] = []
+    for _ in range(count):
+        kind = rng.random()
+        if kind < 0.4:
+            keys = [key for _ in range(rng.integers(1, 4)) for key in random_box(extent, rng)]
+            steps.append(dense_step(keys, setting, rng))
+        elif kind < 0.75:
+            masks = [random_box(extent, rng) if rng.random() < 0.95 else [] for _ in range(rng.integers(1, 7))]
+            steps.append(proposal_step(masks, setting, rng))
+        elif kind < 0.9:
+            steps.append(WindowStep(rng.uniform(-extent, extent, 3) * setting.voxel_size_m))
+        else:
+            steps.append(FuseStep())
+    return steps
+
+
+settings_of_maps = st.builds(
+    Setting,
+    voxel_size_m=st.sampled_from([0.05, 0.07, 0.25]),
+    max_hypotheses=st.integers(1, 4),
+    iou_threshold=st.sampled_from([0.0, 0.2, 0.5]),
+    variance_ratio=st.sampled_from([0.25, 1.0, 5.0]),
+    window_radius_m=st.sampled_from([0.0, 0.07, 0.12]),
+    dimension=st.integers(2, 6),
+)
+
+_cells = st.tuples(st.integers(-2, 1), st.integers(-2, 1), st.integers(-1, 0))
+_seeds = st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def _boxes(draw: st.DrawFn) -> list[Key]:
+    a, b = draw(_cells), draw(_cells)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    keys = [tuple(int(each) for each in low + offset) for offset in np.ndindex(*(high - low + 1))]
+    return keys + draw(st.lists(st.sampled_from(keys), max_size=3))
+
+
+@st.composite
+def sequences(draw: st.DrawFn, dtype: str = "float32", max_steps: int = 12) -> tuple[Setting, list[Step]]:
+    """A map's setting and what happens to it; shrinks in the number of steps, masks and voxels."""
+    setting = draw(settings_of_maps)
+    setting = Setting(**{**setting.__dict__, "dtype": dtype})
+    kinds = draw(st.lists(st.sampled_from(["dense", "proposals", "proposals", "window", "fuse"]), max_size=max_steps))
+    steps: list[Step] = []
+    for kind in kinds:
+        rng = np.random.default_rng(draw(_seeds))
+        if kind == "dense":
+            steps.append(dense_step(draw(st.lists(_cells, max_size=20)), setting, rng))
+        elif kind == "proposals":
+            masks = draw(st.lists(st.one_of(_boxes(), st.lists(_cells, max_size=4)), max_size=4))
+            steps.append(proposal_step(masks, setting, rng))
+        elif kind == "window":
+            steps.append(WindowStep(rng.uniform(-2.5, 2.5, 3) * setting.voxel_size_m))
+        else:
+            steps.append(FuseStep())
+    return setting, steps
