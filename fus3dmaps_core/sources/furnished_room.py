@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_core.sources import furniture, textures
-from fus3dmaps_core.sources.camera_path import CameraPath, Viewpoint
-from fus3dmaps_core.sources.depth_noise import DepthSensor
-from fus3dmaps_core.sources.photographs import photograph
-from fus3dmaps_core.sources.rendering import Rendering, SceneRenderer
-from fus3dmaps_core.sources.scene import Material, Placement, Scene, SceneBuilder, SceneObject
+from fus3dmaps_core.simulation import furniture, textures
+from fus3dmaps_core.simulation.camera_path import CameraPath, Viewpoint
+from fus3dmaps_core.simulation.depth_noise import DepthSensor
+from fus3dmaps_core.simulation.photographs import photograph
+from fus3dmaps_core.simulation.rendering import Rendering, SceneRenderer
+from fus3dmaps_core.simulation.scene import Material, Placement, Scene, SceneBuilder, SceneObject
 
 CAMERA = Intrinsics(fx=550.0, fy=550.0, cx=319.5, cy=239.5, width=640, height=480)
 EPOCH_NS = 1_700_000_000_000_000_000

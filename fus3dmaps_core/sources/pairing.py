@@ -73,7 +73,7 @@ class _Stamped:
 class FramePairer:
     """Pairs each colour image with the nearest depth image and the pose at its stamp.
 
-    Feed it with the ``add_`` methods and collect with :meth:`poll`. Whatever cannot be used is dropped and counted, never
+    Feed it with the ``add_`` methods and call :meth:`poll` after each. Whatever cannot be used is dropped and counted, never
     raised. Time is that of the stamps: an image is given up once any input has moved ``max_wait_s`` past it, so memory
     stays bounded by what arrives in that span. A stamp that goes back more than three seconds (a looped recording, a
     restarted simulation) ends what was waiting and pairing goes on from the new time. Each image gets the newest camera
@@ -108,7 +108,7 @@ class FramePairer:
         self._intrinsics: Intrinsics | None = None
         self._rgb: deque[_Stamped] = deque()
         self._depth: deque[_Stamped] = deque()
-        self._poses = PoseBuffer(config.max_pose_gap_s, horizon_s=config.max_wait_s + config.max_pose_gap_s)
+        self._poses = PoseBuffer(config.max_pose_gap_s)
         self._last_ns: dict[_Stream, int] = {}
         self._ready: list[PairedMessages] = []
         self.received: Counter[str] = Counter()
@@ -227,7 +227,7 @@ class FramePairer:
                     break
                 self._ready.append(paired)
             self._rgb.popleft()
-        # Depth older than this can meet no colour image any more: colour stamps only rise.
+        # What is older than this can meet no colour image any more: colour stamps only rise.
         oldest_ns = newest_ns - self._max_wait_ns
         if self._rgb:
             oldest_ns = self._rgb[0].stamp_ns
@@ -235,6 +235,7 @@ class FramePairer:
             oldest_ns = max(oldest_ns, self._last_ns["rgb"])
         while self._depth and self._depth[0].stamp_ns < oldest_ns - self._tolerance_ns:
             self._depth.popleft()
+        self._poses.forget_before(oldest_ns)
 
     def _pair(self, rgb: _Stamped, final: bool) -> PairedMessages | None:
         """The complete pair, or None while something may still come; FrameError once something cannot."""

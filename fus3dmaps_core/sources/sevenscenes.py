@@ -129,7 +129,8 @@ def _read_image(path: Path, flags: int, dtype: np.dtype[Any], dimensions: int) -
 
 def _read_matrix(path: Path, shape: tuple[int, int]) -> NDArray[np.float64]:
     try:
-        matrix = np.loadtxt(path, dtype=np.float64, ndmin=2)
+        rows = [line.split() for line in path.read_text().splitlines() if line.strip()]
+        matrix = np.array(rows, dtype=np.float64)
     except (OSError, ValueError) as error:
         raise RecordingError(f"cannot read '{path}': {error}") from None
     if matrix.shape != shape or not np.all(np.isfinite(matrix)):

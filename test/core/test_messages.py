@@ -93,7 +93,7 @@ def test_unusable_depth_images_are_refused():
         (ros.image(0, "16UC1", data=np.zeros(47, np.uint8)), "size_mismatch"),
         (ros.image(0, "32FC1"), "bad_image"),
     ]:
-        with pytest.raises(FrameError, match="^/depth: ") as caught:
+        with pytest.raises(FrameError, match=r"^/depth: ") as caught:
             messages.check_depth(message, "/depth")
         assert caught.value.reason == reason
     with pytest.raises(FrameError, match="'rgb8'"):
@@ -124,7 +124,7 @@ def test_camera_model_of_a_binned_region():
 
 @pytest.mark.parametrize("focal", [0.0, -5.0, np.nan])
 def test_uncalibrated_camera_is_refused(focal):
-    with pytest.raises(FrameError, match="^/info: ") as caught:
+    with pytest.raises(FrameError, match=r"^/info: ") as caught:
         messages.to_intrinsics(ros.camera_info(0, focal=focal), "/info")
     assert caught.value.reason == "bad_intrinsics"
 
@@ -156,7 +156,7 @@ def test_poses_agree_with_scipy(build, position, quaternion, scale):
 )
 def test_poses_that_are_no_poses_are_refused(position, quaternion):
     for build in (ros.pose, ros.odometry):
-        with pytest.raises(FrameError, match="^/tracker: ") as caught:
+        with pytest.raises(FrameError, match=r"^/tracker: ") as caught:
             messages.to_pose(build(0, position, quaternion), "/tracker")
         assert caught.value.reason == "bad_pose"
 

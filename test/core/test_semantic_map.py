@@ -175,16 +175,12 @@ def test_points_belong_to_their_voxel_kilometres_away_and_at_its_walls():
     engine = engine_of(Setting(voxel_size_m=0.05))
     keys = np.array([[-1_000_000, -1_000_000, 1_000_000], [-1, 0, -2], [0, 0, 0], [400_000, -400_000, 3]])
     inside = np.array([0.01, 0.99, 0.5])
-    engine.integrate_dense(
-        (keys + inside) * 0.05, np.zeros(4, int), np.ones((1, 5)), np.ones(1), np.zeros((4, 3), np.uint8)
-    )
+    engine.integrate_dense((keys + inside) * 0.05, np.zeros(4, int), np.ones((1, 5)), np.ones(1), np.zeros((4, 3), np.uint8))
     assert sorted(engine.export_state()["voxel_coordinates"].tolist()) == keys.tolist()
 
     # Half a metre is a power of two: points on the wall itself belong to the voxel above it, also below zero.
     engine = engine_of(Setting(voxel_size_m=0.5))
-    ids = engine.integrate_proposals(
-        np.array([[0.5, -0.5, 0.0], [-0.0, 1.0, -1.0]]), np.zeros(2, int), np.ones((1, 5))
-    )
+    ids = engine.integrate_proposals(np.array([[0.5, -0.5, 0.0], [-0.0, 1.0, -1.0]]), np.zeros(2, int), np.ones((1, 5)))
     assert ids.tolist() == [0]
     assert sorted(engine.export_state()["voxel_coordinates"].tolist()) == [[0, 2, -2], [1, -1, 0]]
 
@@ -355,9 +351,7 @@ def test_bad_dense_input_is_refused_and_changes_nothing(field: str, value: np.nd
     DenseStep(**DENSE).apply(engine)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"), cases(points_m=BAD_POINTS, proposals=BAD_INDICES, embeddings=BAD_EMBEDDINGS)
-)
+@pytest.mark.parametrize(("field", "value"), cases(points_m=BAD_POINTS, proposals=BAD_INDICES, embeddings=BAD_EMBEDDINGS))
 def test_bad_proposals_are_refused_and_change_nothing(field: str, value: np.ndarray):
     engine = used_map()
     before = engine.export_state()
@@ -367,7 +361,9 @@ def test_bad_proposals_are_refused_and_change_nothing(field: str, value: np.ndar
     ProposalStep(**PROPOSALS).apply(engine)
 
 
-@pytest.mark.parametrize("center", [np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0]), np.zeros((1, 3)), np.array([np.inf, 0, 0])])
+@pytest.mark.parametrize(
+    "center", [np.array([0.0, np.nan, 0.0]), np.array([0.0, 0.0]), np.zeros((1, 3)), np.array([np.inf, 0, 0])]
+)
 def test_a_bad_window_centre_is_refused_and_changes_nothing(center: np.ndarray):
     engine = used_map()
     before = engine.export_state()

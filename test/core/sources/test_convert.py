@@ -39,7 +39,7 @@ def test_a_converted_dataset_gives_the_same_frames(sequence, tmp_path):
 def test_formats_are_known_by_name(sequence, tmp_path):
     assert "sevenscenes" in names()
     assert isinstance(open_dataset("sevenscenes", sequence), SevenScenes)
-    with pytest.raises(RecordingError, match="'kitti'.*sevenscenes"):
+    with pytest.raises(RecordingError, match=r"'kitti'.*sevenscenes"):
         convert("kitti", sequence, tmp_path / "out.mcap")
 
 

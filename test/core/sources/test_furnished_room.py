@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
+from fus3dmaps_core.simulation.photographs import photograph
 from fus3dmaps_core.sources.furnished_room import EPOCH_NS, FurnishedRoom
-from fus3dmaps_core.sources.photographs import photograph
 
 
 @pytest.fixture(scope="module")

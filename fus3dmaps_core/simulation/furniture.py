@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.sources import textures
-from fus3dmaps_core.sources.scene import Material, Placement, SceneBuilder
+from fus3dmaps_core.simulation import textures
+from fus3dmaps_core.simulation.scene import Material, Placement, SceneBuilder
 
 
 @dataclass(frozen=True)

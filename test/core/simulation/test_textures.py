@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from fus3dmaps_core.sources import textures
+from fus3dmaps_core.simulation import textures
 
 COLOR = (180, 150, 120)
 KINDS = {"plaster": textures.plaster, "fabric": textures.fabric, "wood": textures.wood, "planks": textures.planks}

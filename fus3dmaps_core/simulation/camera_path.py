@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
-from fus3dmaps_core.sources.scene import UP
+from fus3dmaps_core.simulation.scene import UP
 
 _RESOLUTION = 2000
 

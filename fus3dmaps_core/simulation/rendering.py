@@ -11,9 +11,9 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_core.sources.lighting import bake_light
-from fus3dmaps_core.sources.scene import Scene
-from fus3dmaps_core.sources.texture_atlas import MipAtlas, pack
+from fus3dmaps_core.simulation.lighting import bake_light
+from fus3dmaps_core.simulation.scene import Scene
+from fus3dmaps_core.simulation.texture_atlas import MipAtlas, pack
 
 _SUBPIXELS = np.array([(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)], np.float32)
 

@@ -4,9 +4,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_core.sources.camera_path import look_at
-from fus3dmaps_core.sources.rendering import SceneRenderer
-from fus3dmaps_core.sources.scene import Material, SceneBuilder
+from fus3dmaps_core.simulation.camera_path import look_at
+from fus3dmaps_core.simulation.rendering import SceneRenderer
+from fus3dmaps_core.simulation.scene import Material, SceneBuilder
 
 CAMERA = Intrinsics(fx=110.0, fy=105.0, cx=62.0, cy=49.5, width=128, height=96)
 QUADRANTS = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 0]]], np.uint8)

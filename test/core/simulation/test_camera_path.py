@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fus3dmaps_core.frame import check_pose
-from fus3dmaps_core.sources.camera_path import CameraPath, Viewpoint, look_at
+from fus3dmaps_core.simulation.camera_path import CameraPath, Viewpoint, look_at
 
 LOOP = [
     Viewpoint((1.0, 0.0, 1.2), (3.0, 0.0, 1.0)),

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fus3dmaps_core.sources.scene import Material, Placement, SceneBuilder
+from fus3dmaps_core.simulation.scene import Material, Placement, SceneBuilder
 
 WHITE = Material(np.full((4, 4, 3), 255, np.uint8))
 ANGLES = st.floats(-np.pi, np.pi)

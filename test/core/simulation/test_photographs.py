@@ -2,11 +2,11 @@ import numpy as np
 import pytest
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_core.sources import photographs
+from fus3dmaps_core.simulation import photographs
 
 
 @pytest.mark.parametrize("name", photographs.FILES)
-def test_every_photograph_is_in_the_wheel_and_in_colour(name):
+def test_every_photograph_is_in_the_wheel(name):
     image = photographs.photograph(name)
     assert image.dtype == np.uint8
     assert image.shape[2] == 3

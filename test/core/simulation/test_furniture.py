@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from fus3dmaps_core.sources import furniture
-from fus3dmaps_core.sources.scene import Material, Placement, SceneBuilder
+from fus3dmaps_core.simulation import furniture
+from fus3dmaps_core.simulation.scene import Material, Placement, SceneBuilder
 
 PALETTE = furniture.Palette.seeded(np.random.default_rng(0))
 PIECES = {

@@ -12,12 +12,12 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
-from fus3dmaps_core.sources.scene import Panel
+from fus3dmaps_core.simulation.scene import Panel
 
 _TEXEL_M = 0.06
 _OFFSET_M = 2e-3
-_AMBIENT = 0.86
-_OCCLUSION_M = 0.35
+_AMBIENT = 0.84
+_OCCLUSION_M = 0.2
 _AMBIENT_RAYS = 64
 _LAMP_GRID = 4
 

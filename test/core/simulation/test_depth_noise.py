@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fus3dmaps_core.sources.depth_noise import DepthSensor
+from fus3dmaps_core.simulation.depth_noise import DepthSensor
 
 STEADY = DepthSensor(lateral_sigma_px=0.0, random_dropout=0.0)
 

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fus3dmaps_core.sources.texture_atlas import MipAtlas, pack
+from fus3dmaps_core.simulation.texture_atlas import MipAtlas, pack
 
 SIZES = st.tuples(st.integers(1, 9), st.integers(1, 9))
 

@@ -1,0 +1,1 @@
+"""Simulated places: textured scenes, a renderer, camera paths and a depth sensor's noise."""
