@@ -1,8 +1,8 @@
-"""Poses over time: a bounded buffer that interpolates."""
+"""Poses over time: a buffer that interpolates and forgets."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from enum import Enum
 
 import numpy as np
@@ -19,20 +19,11 @@ class PoseGap(Enum):
 
 
 class PoseBuffer:
-    """The poses of the last seconds, in stamp order; holds nothing older than ``horizon_s`` before the newest.
+    """Poses in stamp order, from the oldest that is still needed to the newest. Not thread-safe."""
 
-    Not thread-safe.
-    """
-
-    def __init__(self, max_gap_s: float, horizon_s: float) -> None:
-        """Set the bounds.
-
-        Args:
-            max_gap_s: Poses farther apart than this are not interpolated, seconds.
-            horizon_s: Span of time that is kept, seconds.
-        """
+    def __init__(self, max_gap_s: float) -> None:
+        """Start empty; poses farther apart than ``max_gap_s`` seconds are not interpolated."""
         self._max_gap_ns = round(max_gap_s * 1e9)
-        self._horizon_ns = round(horizon_s * 1e9)
         self._stamps_ns: list[int] = []
         self._poses: list[NDArray[np.float64]] = []
 
@@ -51,7 +42,7 @@ class PoseBuffer:
         return self._stamps_ns[-1] if self._stamps_ns else None
 
     def add(self, stamp_ns: int, T: NDArray[np.float64]) -> None:
-        """Append a pose and forget those beyond the horizon.
+        """Append a pose.
 
         Args:
             stamp_ns: Must be later than that of every pose before.
@@ -64,9 +55,6 @@ class PoseBuffer:
             raise ValueError(f"pose stamp {stamp_ns} is not later than {self._stamps_ns[-1]}")
         self._stamps_ns.append(stamp_ns)
         self._poses.append(T)
-        expired = bisect_left(self._stamps_ns, stamp_ns - self._horizon_ns)
-        del self._stamps_ns[:expired]
-        del self._poses[:expired]
 
     def lookup(self, stamp_ns: int) -> NDArray[np.float64] | PoseGap:
         """The pose at a stamp: the stored one where stamps coincide, else position by lerp and rotation by slerp.
@@ -86,6 +74,12 @@ class PoseBuffer:
         if end_ns - start_ns > self._max_gap_ns:
             return PoseGap.TOO_WIDE
         return _interpolate(self._poses[after - 1], self._poses[after], (stamp_ns - start_ns) / (end_ns - start_ns))
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Forget the poses that no lookup at this stamp or later needs."""
+        needless = max(bisect_right(self._stamps_ns, stamp_ns) - 1, 0)
+        del self._stamps_ns[:needless]
+        del self._poses[:needless]
 
     def clear(self) -> None:
         """Forget every pose."""

@@ -75,7 +75,7 @@ class BagSource:
         }
         damage: RecordingError | None = None
         messages = self._reader.messages(self._inputs)
-        while damage is None:
+        while True:
             try:
                 raw = next(messages, None)
             except RecordingError as error:

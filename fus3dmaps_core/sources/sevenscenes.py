@@ -76,10 +76,7 @@ class SevenScenes:
             depth_mm = _read_image(depth_file, cv2.IMREAD_UNCHANGED, np.dtype(np.uint16), 2)
             depth_m = np.where(depth_mm == _NO_READING, 0, depth_mm).astype(np.float32) * np.float32(0.001)
             height, width = rgb.shape[:2]
-            try:
-                intrinsics = Intrinsics(self._K[0, 0], self._K[1, 1], self._K[0, 2], self._K[1, 2], width, height)
-            except FrameError as error:
-                raise RecordingError(f"'{self._intrinsics_file}': {error}") from None
+            intrinsics = Intrinsics(self._K[0, 0], self._K[1, 1], self._K[0, 2], self._K[1, 2], width, height)
             yield PosedFrame(_stamp_ns(number), rgb, depth_m, intrinsics, self._read_pose(number))
 
     @property

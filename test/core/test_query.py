@@ -6,14 +6,15 @@ import math
 
 import numpy as np
 import pytest
-from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.agreement import KnownTexts, apply_to_both, assert_same_answer, engine_of, reference_of
 from reference.steps import Setting, embeddings_of, random_steps
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.errors import QueryError
+from fus3dmaps_core.query import TextQuery, answer_query
+from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)

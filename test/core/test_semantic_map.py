@@ -7,10 +7,6 @@ import threading
 
 import numpy as np
 import pytest
-from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.query import TextQuery
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from reference.agreement import KnownTexts, apply_to_both, assert_same_answer, assert_same_map, engine_of, reference_of
@@ -26,6 +22,11 @@ from reference.steps import (
     random_steps,
     sequences,
 )
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.query import TextQuery
+from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
 
 
 def ask_everything(engine, reference, setting: Setting, seed: int) -> None:

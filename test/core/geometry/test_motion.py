@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fus3dmaps_core.geometry.motion import KeyframeGate, rotation_angle_rad
 from hypothesis import given
 from hypothesis import strategies as st
 from reference.gates import keyframes, moved_m, turned_rad
 from scipy.spatial.transform import Rotation
+
+from fus3dmaps_core.geometry.motion import KeyframeGate, rotation_angle_rad
 
 
 def pose(position=(0.0, 0.0, 0.0), rotation_vector=(0.0, 0.0, 0.0)) -> np.ndarray:

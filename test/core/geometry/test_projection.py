@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from fus3dmaps_core.config import ImageConfig
-from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_core.geometry.projection import resize_frame, sample_pattern, sample_pixels, unproject
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.projection import patch_of_pixel, project_point, unproject_pixel, valid_depth
 from scipy.spatial.transform import Rotation
+
+from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.frame import Intrinsics, PosedFrame
+from fus3dmaps_core.geometry.projection import resize_frame, sample_pattern, sample_pixels, unproject
 
 
 def random_pose(rng: np.random.Generator, far_m: float = 3.0) -> np.ndarray:

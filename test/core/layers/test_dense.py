@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
-from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.semantic_map import SemanticMap
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.steps import DenseStep, Setting, dense_step
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.semantic_map import SemanticMap
 
 VOXEL = np.array([0.02, 0.02, 0.02])
 GREY = np.full(3, 90, np.uint8)
@@ -111,7 +114,7 @@ def test_it_is_the_same_whether_points_arrive_in_one_frame_or_in_many(seed: int,
     whole, parts = a_map(4), a_map(4)
     frame.apply(whole)
     edges = sorted({0, count, *(min(cut, count) for cut in cuts)})
-    for low, high in zip(edges, edges[1:], strict=False):
+    for low, high in itertools.pairwise(edges):
         part = slice(low, high)
         DenseStep(frame.points_m[part], frame.patches[part], frame.embeddings, frame.weights, frame.colors[part]).apply(
             parts

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.semantic_map import SemanticMap
 

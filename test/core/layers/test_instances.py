@@ -6,10 +6,11 @@ from collections.abc import Iterable
 
 import numpy as np
 import pytest
-from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.semantic_map import SemanticMap
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.semantic_map import SemanticMap
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)

@@ -7,6 +7,8 @@ import pytest
 import ros_messages as ros
 from mcap.writer import Writer
 from recorded_frames import PERIOD_NS, START_NS, assert_same_frames, noise_frames
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as RosbagsWriter
 
 from fus3dmaps_core.config import ImageConfig, InputConfig
 from fus3dmaps_core.errors import RecordingError
@@ -122,6 +124,17 @@ def test_a_topic_of_another_type_is_named(recording):
         BagSource(recording, InputConfig(depth_topic="pose"))
     with pytest.raises(RecordingError, match=r"no topic '/odom' \(parameter 'input\.odometry_topic'\)"):
         BagSource(recording, InputConfig(pose_source="odometry"))
+
+
+def test_a_topic_without_messages_is_named(tmp_path):
+    with RosbagsWriter(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        rgb = writer.add_connection("/rgb/image", "sensor_msgs/msg/Image", typestore=ros.TYPESTORE)
+        writer.add_connection("/depth/image", "sensor_msgs/msg/Image", typestore=ros.TYPESTORE)
+        writer.write(rgb, S, ros.TYPESTORE.serialize_cdr(ros.image(S), "sensor_msgs/msg/Image"))
+    with pytest.raises(
+        RecordingError, match=r"holds no messages on topic '/depth/image' \(parameter 'input\.depth_topic'\)"
+    ):
+        BagSource(tmp_path / "bag", InputConfig())
 
 
 def test_odometry_recordings(tmp_path):

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxels.hash import MAX_COORDINATE, VoxelHash, pack, unpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.voxels.hash import MAX_COORDINATE, VoxelHash, pack, unpack
 
 CPU = torch.device("cpu")
 

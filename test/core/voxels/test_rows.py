@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from fus3dmaps_core.voxels.rows import BLOCK_ROWS, RowPool
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from fus3dmaps_core.voxels.rows import BLOCK_ROWS, RowPool
 
 CPU = torch.device("cpu")
 
