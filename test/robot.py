@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,6 @@ import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
@@ -24,7 +23,7 @@ from std_msgs.msg import Header
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_ros.inputs import input_qos
-from fus3dmaps_ros.mapper_node import MapperNode
+from fus3dmaps_ros.mapper_node import CallbackExecutor, MapperNode
 
 TIMEOUT_S = 60.0
 
@@ -80,31 +79,48 @@ def pose_message(frame: PosedFrame) -> PoseStamped:
     return message
 
 
-def _spin(executor: Any) -> None:
-    with suppress(ExternalShutdownException):
-        executor.spin()
+class CallbackThreads:
+    """Runs the callbacks of nodes, each in threads of its own, for as long as the context lasts."""
+
+    def __init__(self, context: Context, *nodes: Node) -> None:
+        self._executors = [CallbackExecutor(4, context=context) for _ in nodes]
+        self._threads = [threading.Thread(target=executor.spin, daemon=True) for executor in self._executors]
+        for executor, node in zip(self._executors, nodes, strict=True):
+            executor.add_node(node)
+
+    def __enter__(self) -> None:
+        for thread in self._threads:
+            thread.start()
+
+    def __exit__(self, *_: object) -> None:
+        assert all(executor.finish(TIMEOUT_S) for executor in self._executors)
+        for thread in self._threads:
+            thread.join(TIMEOUT_S)
+            assert not thread.is_alive()
+
+
+_numbers = itertools.count()
 
 
 class Robot:
     """A mapper node with stand-in models, and a second node that plays the camera and the user."""
 
     def __init__(self, make_pipeline: Callable[[Any], Pipeline] = stand_in_pipeline, **parameters: Any) -> None:
+        self._odometry = parameters.get("input.pose_source") == "odometry"
         self.context = Context()
         rclpy.init(args=[], context=self.context)
+        # Robots of several tests may live at the same time.
+        self.namespace = f"/robot_{next(_numbers)}"
         overrides = {"node.input_qos": "reliable", "node.publish_period_s": 0.1, "node.queue_size": 100, **parameters}
         self.mapper = MapperNode(
             make_pipeline,
             context=self.context,
+            namespace=self.namespace,
             parameter_overrides=[Parameter(name, value=value) for name, value in overrides.items()],
         )
-        self.user = Node("user", context=self.context)
-        self._executors = [MultiThreadedExecutor(4, context=self.context), SingleThreadedExecutor(context=self.context)]
-        self._threads = []
-        for executor, node in zip(self._executors, (self.mapper, self.user), strict=True):
-            executor.add_node(node)
-            thread = threading.Thread(target=_spin, args=(executor,), daemon=True)
-            thread.start()
-            self._threads.append(thread)
+        self.user = Node("user", context=self.context, namespace=self.namespace)
+        self._threads = CallbackThreads(self.context, self.mapper, self.user)
+        self._threads.__enter__()
         qos = input_qos("reliable", 100)
         self.publishers = {
             "rgb": self.user.create_publisher(Image, "rgb/image", qos),
@@ -112,7 +128,8 @@ class Robot:
             "info": self.user.create_publisher(CameraInfo, "rgb/camera_info", qos),
             "pose": self.user.create_publisher(PoseStamped, "pose", qos),
         }
-        wait_until(lambda: all(outlet.get_subscription_count() for outlet in self.publishers.values()), "inputs matched")
+        expected = [outlet for name, outlet in self.publishers.items() if name != "pose" or not self._odometry]
+        wait_until(lambda: all(outlet.get_subscription_count() for outlet in expected), "inputs matched")
 
     def show(self, frame: PosedFrame) -> None:
         """Publish all that belongs to a frame."""
@@ -126,11 +143,15 @@ class Robot:
 
     def map(self, frame: PosedFrame) -> None:
         """Publish a frame and wait until it is in the map."""
+        worker = self.mapper.worker
+        revision = worker.revision
         self.show(frame)
-        wait_until(lambda: self.mapper.worker.stamp_ns == frame.stamp_ns, f"frame {frame.stamp_ns} mapped")
+        wait_until(
+            lambda: worker.stamp_ns == frame.stamp_ns and worker.revision > revision, f"frame {frame.stamp_ns} mapped"
+        )
 
     def call(self, service_type: Any, name: str, **fields: Any) -> Any:
-        client = self.user.create_client(service_type, f"/fus3dmaps/{name}")
+        client = self.user.create_client(service_type, f"fus3dmaps/{name}")
         assert client.wait_for_service(TIMEOUT_S), name
         future = client.call_async(service_type.Request(**fields))
         wait_until(future.done, f"reply of {name}")
@@ -138,8 +159,8 @@ class Robot:
         return future.result()
 
     def close(self) -> None:
-        assert self.mapper.stop()
+        self._threads.__exit__()
+        assert self.mapper.stop(TIMEOUT_S)
+        self.mapper.destroy_node()
+        self.user.destroy_node()
         rclpy.shutdown(context=self.context)
-        for thread in self._threads:
-            thread.join(TIMEOUT_S)
-            assert not thread.is_alive()

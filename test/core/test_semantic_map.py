@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -308,6 +309,7 @@ BAD_WEIGHTS = {
     "a negative weight": np.array([1.0, -0.25]),
     "a weight of NaN": np.array([1.0, np.nan]),
     "an infinite weight": np.array([np.inf, 1.0]),
+    "a weight that single precision cannot hold": np.array([1e300, 1.0]),
     "too few weights": np.array([1.0]),
     "too many weights": np.ones(3),
     "weights of two axes": np.ones((2, 1)),
@@ -371,6 +373,96 @@ def test_a_bad_window_centre_is_refused_and_changes_nothing(center: np.ndarray):
     with pytest.raises(MapError):
         engine.prune_window(center)
     assert_same_bytes(engine.export_state(), before)
+
+
+@pytest.mark.parametrize(
+    ("length", "dtype"),
+    [
+        (1e30, np.float32),
+        (1e-12, np.float32),
+        (1e-20, np.float32),
+        (1e-30, np.float32),
+        (1e300, np.float64),
+        (6e4, np.float16),
+    ],
+)
+def test_embeddings_may_have_any_length_but_zero(length: float, dtype: type):
+    embeddings = np.array([[0.6 * length, 0.8 * length, 0, 0, 0]], dtype)
+    engine = engine_of(Setting())
+    point, none = np.full((1, 3), 0.02), np.zeros(1, int)
+    engine.integrate_dense(point, none, embeddings, np.ones(1), np.zeros((1, 3), np.uint8))
+    engine.integrate_proposals(point, none, embeddings)
+    state = engine.export_state()
+    for name in ("dense_embedding", "instance_embedding"):
+        np.testing.assert_allclose(state[name], [[0.6, 0.8, 0, 0, 0]], atol=1e-3 if dtype is np.float16 else 1e-6)
+
+
+BAD_STATES = {
+    "voxel_coordinates": {
+        "a voxel beyond the grid": lambda array: changed(array, (0, 0), 2**30),
+        "a voxel twice": lambda array: changed(array, 0, array[1]),
+        "coordinates that are not integers": lambda array: array + 0.5,
+    },
+    "voxel_colors": {"fewer colours than voxels": lambda array: array[:-1]},
+    "dense_slot": {
+        "a slot beyond the voxels": lambda array: changed(array, 0, 10**6),
+        "a negative slot": lambda array: changed(array, 0, -1),
+        "a slot twice": lambda array: changed(array, 0, array[1]),
+    },
+    "dense_weight": {
+        "a negative weight": lambda array: changed(array, 0, -1.0),
+        "a weight of NaN": lambda array: changed(array, 0, np.nan),
+    },
+    "dense_embedding": {
+        "NaN in a mean": lambda array: changed(array, (0, 0), np.nan),
+        "means of another width": lambda array: array[:, :-1],
+    },
+    "hypothesis_id": {"an unknown instance": lambda array: changed(array, (0, 0), 10**6)},
+    "hypothesis_count": {"a negative count": lambda array: changed(array, (0, 0), -4)},
+    "instance_id": {
+        "an id twice": lambda array: changed(array, 0, array[1]),
+        "an id that was never given": lambda array: changed(array, -1, 10**6),
+    },
+    "instance_embedding": {"NaN in an instance": lambda array: changed(array, (0, 0), np.nan)},
+    "fused_embedding": {"NaN in a fused instance": lambda array: changed(array, (0, 0), np.nan)},
+}
+
+
+@pytest.mark.parametrize(
+    ("field", "spoil"),
+    [pytest.param(field, spoil, id=name) for field, spoils in BAD_STATES.items() for name, spoil in spoils.items()],
+)
+def test_a_state_that_is_no_map_is_refused_and_changes_nothing(field: str, spoil: Callable[[np.ndarray], np.ndarray]):
+    engine = used_map()
+    before = engine.export_state()
+    with pytest.raises(MapError):
+        engine.import_state({**before, field: spoil(before[field])})
+    assert_same_bytes(engine.export_state(), before)
+
+
+@pytest.mark.parametrize("field", sorted(engine_of(Setting()).export_state()))
+def test_a_state_that_lacks_an_array_is_refused_by_its_name(field: str):
+    engine = used_map()
+    before = engine.export_state()
+    with pytest.raises(MapError, match=field):
+        engine.import_state({name: array for name, array in before.items() if name != field})
+    assert_same_bytes(engine.export_state(), before)
+
+
+def test_an_imported_state_replaces_what_the_map_held_and_goes_on_from_there():
+    setting = Setting()
+    source, target = engine_of(setting), engine_of(setting)
+    reference = reference_of(setting)
+    for step in random_steps(setting, extent=3, count=25, seed=6):
+        apply_to_both(step, source, reference)
+    for step in random_steps(setting, extent=3, count=25, seed=7):
+        step.apply(target)
+    target.import_state(source.export_state())
+    assert_same_bytes(target.export_state(), source.export_state())
+    ask_everything(target, reference, setting, 1)
+    for step in random_steps(setting, extent=3, count=25, seed=8):
+        apply_to_both(step, target, reference)
+        assert_same_map(target, reference, setting)
 
 
 def test_what_is_handed_in_stays_as_it_was_and_what_is_handed_out_is_a_copy():

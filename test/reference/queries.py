@@ -14,20 +14,15 @@ def layer_embeddings(reference: ReferenceMap, layer: str) -> dict[Key, Vector]:
     """Embedding of every voxel that has one in a layer."""
     if layer == "dense":
         return dict(reference.dense_mean)
-    answer: dict[Key, Vector] = {}
-    for key in reference.voxels:
-        top = reference.top_of(key)
-        if layer == "fused_dense":
-            embedding = reference.fused_dense(key)
-        elif top is None:
-            continue
-        elif layer == "instances":
-            embedding = reference.instances[top].embedding
-        else:
-            embedding = reference.query_embedding(top)
-        if embedding is not None:
-            answer[key] = embedding
-    return answer
+    if layer == "fused_dense":
+        fused = {key: reference.fused_dense(key) for key in reference.voxels}
+        return {key: embedding for key, embedding in fused.items() if embedding is not None}
+    if layer == "instances":
+        of_instance = {each: instance.embedding for each, instance in reference.instances.items()}
+    else:
+        of_instance = {each: reference.query_embedding(each) for each in reference.instances}
+    tops = {key: reference.top_of(key) for key in reference.voxels}
+    return {key: of_instance[top] for key, top in tops.items() if top is not None}
 
 
 def relevancy(embedding: Vector, prompt: Vector, negatives: list[Vector], logit_scale: float) -> float:
@@ -35,9 +30,7 @@ def relevancy(embedding: Vector, prompt: Vector, negatives: list[Vector], logit_
     positive = cosine(embedding, prompt)
     if not negatives:
         return positive
-    return min(
-        1.0 / (1.0 + math.exp(logit_scale * (cosine(embedding, negative) - positive))) for negative in negatives
-    )
+    return min(1.0 / (1.0 + math.exp(logit_scale * (cosine(embedding, negative) - positive))) for negative in negatives)
 
 
 @dataclass(frozen=True)
@@ -74,9 +67,7 @@ def ranking(
     for number, prompt in enumerate(prompts):
         for instance_id in reference.instances:
             members = occupied_voxels(reference, instance_id)
-            scored = [
-                relevancy(embeddings[key], prompt, negatives, logit_scale) for key in members if key in embeddings
-            ]
+            scored = [relevancy(embeddings[key], prompt, negatives, logit_scale) for key in members if key in embeddings]
             if len(members) < min_voxels or not scored:
                 continue
             score = sum(scored) / len(scored)

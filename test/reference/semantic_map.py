@@ -157,7 +157,7 @@ class ReferenceMap:
             weight = self.dense_weight.get(key, 0.0)
             support = self.variance_ratio * self.hypotheses[key][instance_id]
             rho = weight + support
-            f_voxel = (weight * self.dense_mean.get(key, np.zeros_like(embedding)) + support * embedding) / rho
+            f_voxel = embedding if weight == 0.0 else (weight * self.dense_mean[key] + support * embedding) / rho
             total = total + rho * f_voxel
             evidence += rho
         return total / evidence, evidence
@@ -199,9 +199,7 @@ class ReferenceMap:
         if self.window_radius_m == 0:
             return 0
         far = [
-            key
-            for key in self.dense_weight
-            if math.dist(center_of(key, self.voxel_size_m), center_m) > self.window_radius_m
+            key for key in self.dense_weight if math.dist(center_of(key, self.voxel_size_m), center_m) > self.window_radius_m
         ]
         for key in far:
             del self.dense_weight[key], self.dense_mean[key], self.dense_updates[key]

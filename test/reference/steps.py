@@ -1,7 +1,8 @@
 """Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, fusions.
 
-A step applies to the reference and to the package's map alike, for both have the same methods. Points lie inside their voxel,
-away from its walls, and dense weights are multiples of 1/64, so that sums are exact and comparisons of evidence have one answer.
+A step applies to the reference and to the package's map alike, for both have the same methods. Points lie inside their
+voxel, away from its walls, and dense weights are multiples of 1/64, so that sums are exact and comparisons of evidence have
+one answer.
 """
 
 from __future__ import annotations

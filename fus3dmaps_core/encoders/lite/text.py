@@ -7,10 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from safetensors.torch import load_file
-from tokenizers import Tokenizer
 
-from fus3dmaps_core.encoders.lite.weights import TEXT_CONFIG, TEXT_MODEL, TOKENIZER
+from fus3dmaps_core.encoders.lite.weights import EXTRA, TEXT_CONFIG, TEXT_MODEL, TOKENIZER
+from fus3dmaps_core.errors import EncoderError
 
 WIDTH = 384
 _MAX_TOKENS = 256  # What the model was trained with; longer prompts are cut.
@@ -26,7 +25,14 @@ class SentenceModel:
         Raises:
             EncoderError: The package is missing or its files are altered.
         """
-        from transformers import BertConfig, BertModel  # Seconds of import, which only those who load the model pay.
+        try:  # Seconds of import, which only those who load the model pay.
+            from safetensors.torch import load_file
+            from tokenizers import Tokenizer
+            from transformers import BertConfig, BertModel
+        except ImportError as error:
+            raise EncoderError(
+                f"encoder 'lite' needs the pip package '{error.name}', which is not installed: pip install {EXTRA}"
+            ) from None
 
         model = BertModel(BertConfig.from_json_file(TEXT_CONFIG.locate()))
         state = load_file(TEXT_MODEL.locate())

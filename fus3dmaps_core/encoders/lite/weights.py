@@ -54,12 +54,16 @@ class WeightFile:
         try:
             path = Path(str(distribution(self.package).locate_file(self.path)))
         except PackageNotFoundError:
-            raise EncoderError(f"encoder 'lite' needs the pip package '{self.package}', which is not installed: {hint}") from None
+            raise EncoderError(
+                f"encoder 'lite' needs the pip package '{self.package}', which is not installed: {hint}"
+            ) from None
         try:
             with path.open("rb") as stream:
                 found = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
-            raise EncoderError(f"encoder 'lite' cannot read '{path}' of the pip package '{self.package}': {error}; re{hint}") from None
+            raise EncoderError(
+                f"encoder 'lite' cannot read '{path}' of the pip package '{self.package}': {error}; re{hint}"
+            ) from None
         if found != self.sha256:
             raise EncoderError(
                 f"encoder 'lite': '{path}' of the pip package '{self.package}' has sha256 {found} instead of {self.sha256}; re{hint}"

@@ -1,0 +1,71 @@
+"""The default encoder trio ``lite``: small networks that pip alone brings, for any CPU.
+
+This is ConSE (Norouzi et al. 2013, "Zero-Shot Learning by Convex Combination of Semantic Embeddings"): an ImageNet classifier
+(EfficientNet-Lite0) and a COCO detector (SSD-MobileNet-v2) say which class names a piece of image goes by, and a small
+sentence model (all-MiniLM-L6-v2) embeds these names and the prompts in one space. Its visual vocabulary is bounded by those
+1000 + 80 names: a prompt is answered through the names nearest to it in meaning. **It is not CLIP**, nor any other network
+trained on images and text together, and what it scores says nothing about the vision-language models of the paper.
+
+Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.weights`. Nothing is ever downloaded.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
+from fus3dmaps_core.encoders.lite.detector import shared_detector
+from fus3dmaps_core.encoders.lite.network import load_classifier
+from fus3dmaps_core.encoders.lite.patch import LitePatchEncoder
+from fus3dmaps_core.encoders.lite.space import DIMENSION, ConceptSpace, LiteTextEncoder
+from fus3dmaps_core.encoders.lite.text import SentenceModel
+from fus3dmaps_core.encoders.lite.vocabulary import load_vocabulary
+from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
+from fus3dmaps_core.errors import EncoderError
+
+_VARIANCE_RATIO = 1.5
+_LOGIT_SCALE = 20.0
+
+
+def load_trio(device: str, crop_padding: float) -> EncoderTrio:
+    """Load the three encoders.
+
+    Args:
+        device: Torch device, e.g. ``cpu`` or ``cuda:0``. The detector runs on the CPU in any case.
+        crop_padding: Padding around a mask's box, as a share of its size.
+
+    Raises:
+        EncoderError: The device cannot be used, or a package or its weights are missing or altered.
+    """
+    _check_device(device)
+    detector, network = shared_detector(), load_classifier(device)
+    model = SentenceModel(device)
+    vocabulary = load_vocabulary(model)
+    space = ConceptSpace(vocabulary, device)
+    return EncoderTrio(
+        name="lite",
+        dimension=DIMENSION,
+        variance_ratio=_VARIANCE_RATIO,
+        logit_scale=_LOGIT_SCALE,
+        patch=LitePatchEncoder(network, detector, space, device),
+        crop=LiteCropEncoder(network, detector, space, crop_padding, device),
+        text=LiteTextEncoder(model, vocabulary),
+    )
+
+
+def load_text_encoder(device: str) -> TextEncoder:
+    """Load the text encoder alone.
+
+    Raises:
+        EncoderError: As :func:`load_trio`.
+    """
+    _check_device(device)
+    model = SentenceModel(device)
+    return LiteTextEncoder(model, load_vocabulary(model))
+
+
+def _check_device(device: str) -> None:
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:  # Torch asserts where it was built without CUDA.
+        raise EncoderError(f"parameter 'encoder.device': torch cannot use '{device}': {error}") from None

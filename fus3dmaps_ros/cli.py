@@ -1,0 +1,304 @@
+"""The ``fus3dmaps`` command. ROS is imported only by the commands that need it: node, play, ask and demo."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import yaml
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from fus3dmaps_core.config import Config
+from fus3dmaps_core.errors import ConfigError, Fus3dmapsError
+
+if TYPE_CHECKING:
+    from fus3dmaps_core.query import RankedInstance
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Open-vocabulary 3D maps from posed RGB-D images.",
+)
+_log = Console(stderr=True, highlight=False)
+_out = Console(highlight=False)
+
+ParamsFile = Annotated[Path | None, typer.Option("--params-file", help="YAML file of parameters, as for the node.")]
+Settings = Annotated[list[str] | None, typer.Option("--set", help="A parameter, e.g. map.voxel_size_m=0.1; repeatable.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
+
+
+def main() -> None:
+    """Run the command; a refusal is one line on stderr and exit code 1."""
+    try:
+        app()
+    except Fus3dmapsError as error:
+        _log.print(f"fus3dmaps: {error}", markup=False, style="red", soft_wrap=True)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+@app.command()
+def convert(
+    dataset: Annotated[str, typer.Argument(help="Layout of the folder: sevenscenes.")],
+    directory: Annotated[Path, typer.Argument(help="The dataset's folder.")],
+    out: Annotated[Path, typer.Argument(help="Recording to write, ending in .mcap.")],
+    overwrite: Overwrite = False,
+) -> None:
+    """Turn a dataset into a rosbag2 MCAP recording."""
+    from fus3dmaps_core.sources.convert import convert as convert_dataset
+
+    with _progress("writing frames") as update:
+        summary = convert_dataset(dataset, directory, out, overwrite=overwrite, on_progress=update)
+    _out.print(
+        f"{out}: {summary.frames} frames, {summary.duration_s:.1f} s of recording, {summary.size_bytes / 1e6:.0f} MB",
+        markup=False,
+        soft_wrap=True,
+    )
+
+
+@app.command(name="map")
+def map_(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 directory or MCAP file.")],
+    out: Annotated[Path, typer.Option("--out", help="Directory for the map.")],
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the run's figures to this file.")] = None,
+) -> None:
+    """Map a recording in process and save the map."""
+    from fus3dmaps_core.offline import map_info, map_recording
+    from fus3dmaps_core.pipeline import Pipeline
+    from fus3dmaps_core.storage import check_map_target, save_map
+
+    config = _config(params_file, settings)
+    check_map_target(out)
+    with _log.status("loading models"):
+        pipeline = Pipeline.from_config(config)
+    with _progress("mapping frames") as update:
+        summary = map_recording(bag, pipeline, update)
+    save_map(out, pipeline.semantic_map, map_info(pipeline, summary.stamp_ns))
+
+    semantic_map = pipeline.semantic_map
+    table = Table("stage", "s", "share", title=f"{out}", title_justify="left")
+    for stage, seconds in sorted(summary.stages_s.items(), key=lambda item: -item[1]):
+        table.add_row(stage, f"{seconds:.2f}", f"{100 * seconds / summary.duration_s:.1f} %")
+    _out.print(table)
+    _out.print(
+        f"{summary.frames} frames, {summary.dense_keyframes} dense and {summary.instance_keyframes} instance keyframes in "
+        f"{summary.duration_s:.1f} s ({summary.keyframes_per_s:.2f} keyframes/s); {semantic_map.voxel_count} voxels, "
+        f"{semantic_map.instance_count} instances, {sum(semantic_map.nbytes().values()) / 1e6:.0f} MB"
+    )
+    for reason, count in summary.drops.most_common():
+        _log.print(f"dropped {count}, {reason}: {summary.last_drop.get(reason, '')}", markup=False, style="yellow")
+    if json_file is not None:
+        figures = {
+            "frames": summary.frames,
+            "dense_keyframes": summary.dense_keyframes,
+            "instance_keyframes": summary.instance_keyframes,
+            "proposals": summary.proposals,
+            "duration_s": summary.duration_s,
+            "keyframes_per_s": summary.keyframes_per_s,
+            "stages_s": dict(summary.stages_s),
+            "drops": dict(summary.drops),
+            "voxels": semantic_map.voxel_count,
+            "dense_voxels": semantic_map.dense_voxel_count,
+            "instances": semantic_map.instance_count,
+            "bytes": semantic_map.nbytes(),
+        }
+        json_file.write_text(json.dumps(figures, indent=1))
+
+
+@app.command()
+def query(
+    map_directory: Annotated[Path, typer.Argument(metavar="MAPDIR", help="A saved map.")],
+    prompts: Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")],
+    top: Annotated[int | None, typer.Option("--top", min=1, help="Answers per prompt.")] = None,
+    layer: Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")] = "",
+    negative: Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")] = None,
+    threshold: Annotated[float | None, typer.Option("--threshold", help="Leave out what scores less.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")] = False,
+    png: Annotated[Path | None, typer.Option("--png", help="Draw the answer into this picture.")] = None,
+    ply: Annotated[Path | None, typer.Option("--ply", help="Write voxel similarities to this PLY file.")] = None,
+) -> None:
+    """Ask a saved map where something is."""
+    from fus3dmaps_core.encoders.registry import load_text_encoder
+    from fus3dmaps_core.query import DEFAULT_LAYER, TextQuery, answer_query
+    from fus3dmaps_core.storage import load_map
+
+    request = TextQuery(prompts, tuple(negative or ()), layer or DEFAULT_LAYER, threshold)
+    request.check()
+    semantic_map, info = load_map(map_directory)
+    request = TextQuery(
+        prompts,
+        tuple(negative or ()),
+        request.layer,
+        threshold,
+        top or info.config.query.top_k,
+        info.config.query.min_voxels,
+    )
+    text_encoder = load_text_encoder(info.encoder, "cpu")
+    answer = answer_query(semantic_map, text_encoder, request, info.logit_scale)
+    _print_answer(answer.instances, info.map_frame, len(prompts) > 1, as_json)
+    if png is not None:
+        from fus3dmaps_core.render import render_answer, write_png
+
+        voxels = semantic_map.voxels()
+        picture = render_answer(
+            voxels.centers_m,
+            voxels.colors,
+            answer.points_m,
+            answer.similarity,
+            answer.instances,
+            info.camera_poses,
+            info.config.map.voxel_size_m,
+            f"{' | '.join(prompts)}   ({answer.layer})",
+        )
+        write_png(png, picture)
+    if ply is not None:
+        from fus3dmaps_core.render import write_ply
+
+        write_ply(ply, answer.points_m, answer.similarity)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+def node(context: typer.Context) -> None:
+    """Run the mapper node; arguments go to ROS, e.g. --ros-args -p map.voxel_size_m:=0.1 -r rgb/image:=/camera/image."""
+    _need_ros()
+    from fus3dmaps_ros.mapper_node import main as run_node
+
+    sys.exit(run_node(context.args))
+
+
+@app.command()
+def play(
+    bag: Annotated[Path, typer.Argument(help="rosbag2 directory or MCAP file.")],
+    rate: Annotated[float, typer.Option("--rate", min=0.0, help="Speed; 0 plays as fast as it is taken.")] = 1.0,
+    wait: Annotated[float, typer.Option("--wait", min=0.0, help="Longest wait for subscribers, seconds.")] = 60.0,
+) -> None:
+    """Publish a recording on its topics, with /clock."""
+    _need_ros()
+    from fus3dmaps_ros.player_node import play as run_player
+
+    sys.exit(run_player(bag, rate=rate, wait_for_subscribers_s=wait))
+
+
+@app.command()
+def ask(
+    prompts: Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")],
+    top: Annotated[int, typer.Option("--top", min=1, help="Answers per prompt.")] = 5,
+    layer: Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")] = "",
+    negative: Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")] = None,
+    node_name: Annotated[str, typer.Option("--node", help="The mapper node.")] = "/fus3dmaps",
+    timeout: Annotated[float, typer.Option("--timeout", min=0.1, help="Longest wait for the node, seconds.")] = 10.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")] = False,
+) -> None:
+    """Ask a running mapper node where something is, and have it publish the similarities."""
+    _need_ros()
+    from fus3dmaps_ros.client import MapperClient, ranked_instances
+
+    with MapperClient(node_name) as client:
+        client.wait_until_ready(timeout)
+        reply = client.ask(prompts, negative_prompts=negative or (), layer=layer, top_k=top, publish=True, timeout_s=timeout)
+    _print_answer(ranked_instances(reply), reply.similarity.header.frame_id, len(prompts) > 1, as_json)
+
+
+@app.command()
+def simulate(
+    out: Annotated[Path, typer.Argument(help="Recording to write, ending in .mcap.")],
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Frames along the way.")] = 60,
+    seed: Annotated[int, typer.Option("--seed", help="Decides textures and depth noise.")] = 0,
+    overwrite: Overwrite = False,
+) -> None:
+    """Record a simulated furnished room in which real photographs hang."""
+    from fus3dmaps_core.recordings.writer import RecordingWriter
+    from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+
+    with _progress("rendering frames") as update, RecordingWriter(out, overwrite=overwrite) as writer:
+        for done, frame in enumerate(FurnishedRoom(seed=seed, frames=frames), start=1):
+            writer.write(frame)
+            update(done, frames)
+    _out.print(f"{out}: {frames} frames", markup=False, soft_wrap=True)
+
+
+@app.command()
+def demo(
+    recording: Annotated[Path | None, typer.Argument(help="Recording to use instead of the simulated room.")] = None,
+    prompts: Annotated[list[str] | None, typer.Argument(metavar="PROMPT...", help="What to ask.")] = None,
+    out: Annotated[Path, typer.Option("--out", help="Directory for pictures and logs.")] = Path("out/demo"),
+) -> None:
+    """Play a recording into a mapper node, ask it for things and draw the answers."""
+    _need_ros()
+    from fus3dmaps_ros.demo import run_demo
+
+    if not run_demo(recording, prompts or (), out, _out):
+        sys.exit(1)
+
+
+def _config(params_file: Path | None, settings: list[str] | None) -> Config:
+    config = Config() if params_file is None else Config.from_yaml(params_file)
+    values: dict[str, Any] = {}
+    for setting in settings or ():
+        key, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {setting}: expected key=value")
+        values[key.strip()] = yaml.safe_load(text)
+    return config.with_values(values)
+
+
+def _print_answer(instances: Sequence[RankedInstance], frame: str, with_prompt: bool, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps([_as_json(found, with_prompt) for found in instances]))
+        return
+    table = Table("rank", "prompt", "score", "x", "y", "z", "size [m]", "voxels", "id", title=f"metres, frame {frame}")
+    for rank, found in enumerate(instances, start=1):
+        size = " x ".join(f"{edge:.2f}" for edge in found.box_max_m - found.box_min_m)
+        place = (f"{value:.2f}" for value in found.centroid_m)
+        table.add_row(str(rank), found.prompt, f"{found.score:.3f}", *place, size, str(found.voxels), str(found.id))
+    _out.print(table)
+
+
+def _as_json(found: RankedInstance, with_prompt: bool) -> dict[str, Any]:
+    entry = {
+        "id": found.id,
+        "score": found.score,
+        "centroid": [float(value) for value in found.centroid_m],
+        "box_min": [float(value) for value in found.box_min_m],
+        "box_max": [float(value) for value in found.box_max_m],
+        "voxels": found.voxels,
+    }
+    return {**entry, "prompt": found.prompt} if with_prompt else entry
+
+
+def _need_ros() -> None:
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        raise ConfigError(
+            f"this command needs ROS 2: {error}; source a Jazzy installation or run scripts/setup.sh"
+        ) from None
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Any]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TaskProgressColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=_log) as progress:
+        task = progress.add_task(label, total=None)
+        yield lambda done, total: progress.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

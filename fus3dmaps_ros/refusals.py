@@ -1,0 +1,17 @@
+"""What a node is refused with: this package's own errors, and rclpy's for arguments and names that it cannot use."""
+
+from __future__ import annotations
+
+from rclpy.exceptions import NameValidationException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+
+from fus3dmaps_core.errors import Fus3dmapsError
+
+# The binding's exception classes have no public module; UnknownROSArgsError does not derive from RCLError.
+REFUSALS: tuple[type[Exception], ...] = (
+    Fus3dmapsError,
+    NameValidationException,
+    rclpy_implementation.RCLError,
+    rclpy_implementation.UnknownROSArgsError,
+)
+"""To be shown as one line, not as a traceback."""

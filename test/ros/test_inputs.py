@@ -1,0 +1,126 @@
+"""Bad input is counted and named, and mapping goes on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from nav_msgs.msg import Odometry
+from robot import camera_info_message, depth_message, header, pose_message, rgb_message, wait_until
+from stand_ins import wall_frame
+
+from fus3dmaps_ros.drops import DropLog
+
+SECOND_NS = 10**9
+START_NS = 1_700_000_000 * SECOND_NS
+
+
+def changed(message: Any, **values: Any) -> Any:
+    for name, value in values.items():
+        setattr(message, name, value)
+    return message
+
+
+def nan_pose(frame: Any) -> Any:
+    message = pose_message(frame)
+    message.pose.position.x = math.nan
+    return message
+
+
+def unnormalised_pose(frame: Any) -> Any:
+    message = pose_message(frame)
+    message.pose.orientation.w = 0.3
+    return message
+
+
+def no_focal_length(frame: Any) -> Any:
+    message = camera_info_message(frame)
+    message.k[0] = 0.0
+    return message
+
+
+FAULTS: list[tuple[str, str, str, Callable[[Any], Any]]] = [
+    ("bad_pose", "pose", "pose", nan_pose),
+    ("bad_pose", "pose", "pose", unnormalised_pose),
+    ("wrong_frame", "pose", "pose", lambda frame: changed(pose_message(frame), header=header(frame.stamp_ns, "odom"))),
+    ("unknown_encoding", "rgb", "rgb/image", lambda frame: changed(rgb_message(frame), encoding="yuv422")),
+    ("unknown_encoding", "depth", "depth/image", lambda frame: changed(depth_message(frame), encoding="rgb8")),
+    ("size_mismatch", "rgb", "rgb/image", lambda frame: changed(rgb_message(frame), height=479)),
+    ("size_mismatch", "depth", "depth/image", lambda frame: changed(depth_message(frame), height=481)),
+    ("bad_image", "rgb", "rgb/image", lambda frame: changed(rgb_message(frame), step=3)),
+    ("bad_intrinsics", "info", "rgb/camera_info", no_focal_length),
+]
+
+
+def test_every_bad_message_is_counted_and_mapping_goes_on(robot) -> None:
+    robot.map(wall_frame(START_NS))
+    expected: dict[str, int] = {}
+    for index, (reason, stream, _, make) in enumerate(FAULTS):
+        robot.publishers[stream].publish(make(wall_frame(START_NS + (1 + index) * SECOND_NS // 10, x_m=1.0)))
+        expected[reason] = expected.get(reason, 0) + 1
+        wait_until(lambda: robot.mapper.drops.counts() == expected, f"counted: {expected}")
+    robot.map(wall_frame(START_NS + 2 * SECOND_NS, x_m=0.5))
+    assert robot.mapper.drops.counts() == expected
+    for reason, count in expected.items():
+        assert f"{reason} {count}" in robot.mapper.status()
+
+
+@pytest.mark.parametrize(("reason", "stream", "topic", "make"), FAULTS)
+def test_the_log_names_the_topic(robot_with_log, reason, stream, topic, make) -> None:
+    robot, lines = robot_with_log
+    robot.publishers["info"].publish(camera_info_message(wall_frame(START_NS)))
+    robot.publishers[stream].publish(make(wall_frame(START_NS)))
+    wait_until(lambda: any(f"({reason}): {topic}" in line for line in lines), f"{reason} logged")
+
+
+@pytest.fixture
+def robot_with_log(make_robot, monkeypatch):
+    """A robot and the lines it logs as drops."""
+    lines: list[str] = []
+    monkeypatch.setattr("fus3dmaps_ros.mapper_node.DropLog", lambda warn: DropLog(lines.append))
+    return make_robot(), lines
+
+
+def test_stamps_that_run_backwards_are_counted_and_a_restart_is_followed(robot) -> None:
+    robot.map(wall_frame(START_NS))
+    robot.publishers["rgb"].publish(rgb_message(wall_frame(START_NS - SECOND_NS)))
+    robot.publishers["depth"].publish(depth_message(wall_frame(START_NS - SECOND_NS)))
+    wait_until(lambda: robot.mapper.drops.counts()["stamp_backwards"] == 2, "backward stamps counted")
+    robot.map(wall_frame(START_NS + SECOND_NS, x_m=0.5))
+    # A simulation that starts again.
+    robot.map(wall_frame(SECOND_NS, x_m=1.0))
+    assert robot.mapper.drops.counts()["time_jump"] >= 1
+
+
+def test_an_image_without_depth_or_pose_is_given_up_and_counted(robot) -> None:
+    robot.map(wall_frame(START_NS))
+    lonely = wall_frame(START_NS + SECOND_NS)
+    robot.publishers["rgb"].publish(rgb_message(lonely))
+    robot.map(wall_frame(START_NS + 5 * SECOND_NS, x_m=0.5))
+    counts = robot.mapper.drops.counts()
+    assert counts["no_depth"] + counts["no_pose"] + counts["pose_gap"] == 1
+
+
+def test_poses_may_come_as_odometry(make_robot) -> None:
+    robot = make_robot(**{"input.pose_source": "odometry"})
+    publisher = robot.user.create_publisher(Odometry, "odom", 10)
+    wait_until(publisher.get_subscription_count, "odometry matched")
+    frame = wall_frame(START_NS)
+    message = Odometry(header=header(START_NS, "map"))
+    message.pose.pose = pose_message(frame).pose
+    publisher.publish(message)
+    robot.map(frame)
+
+
+def test_topics_without_a_message_are_named(robot) -> None:
+    silent = robot.mapper._inputs.silent()
+    assert [phrase.split()[0].removeprefix(robot.namespace) for phrase in silent] == [
+        "/rgb/camera_info",
+        "/rgb/image",
+        "/depth/image",
+        "/pose",
+    ]
+    robot.map(wall_frame(START_NS))
+    assert robot.mapper._inputs.silent() == []
