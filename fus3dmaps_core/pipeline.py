@@ -121,7 +121,7 @@ class Pipeline:
 
     def camera_poses(self) -> NDArray[np.float64]:
         """Poses T_world_camera of the keyframes so far: (n, 4, 4)."""
-        return np.array(self._camera_poses, dtype=np.float64).reshape(-1, 4, 4)
+        return np.array(list(self._camera_poses), dtype=np.float64).reshape(-1, 4, 4)
 
     def _integrate_dense(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
         with report.timed("patch_encoder"):
@@ -163,6 +163,6 @@ class Pipeline:
         valid = working.depth_m[pixels.ys, pixels.xs] > 0
         ys, xs = pixels.ys[valid], pixels.xs[valid]
         inside = masks.masks[:, ys, xs]
-        masks = masks.take(inside.any(axis=1))
-        proposals, samples = np.nonzero(inside[inside.any(axis=1)])
-        return proposals, ys[samples], xs[samples], masks
+        seen = np.flatnonzero(inside.any(axis=1))
+        proposals, samples = np.nonzero(inside[seen])
+        return proposals, ys[samples], xs[samples], masks.take(seen)

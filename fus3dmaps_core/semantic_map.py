@@ -29,6 +29,7 @@ from fus3dmaps_core.voxels.hash import MAX_COORDINATE, VoxelHash, pack
 LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
 """Names of the layers that can be queried."""
 
+_MAX_WEIGHT = 1e6  # Far from where sums in float32 would overflow.
 _UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
 
 
@@ -183,7 +184,7 @@ class SemanticMap:
             points_m: (n, 3) in the map frame, metres.
             patches: (n,) patch of each point.
             embeddings: (p, d), one per patch, any length but 0.
-            weights: (p,) weight of one observation of each patch, not negative.
+            weights: (p,) weight of one observation of each patch, in [0, 1e6]; encoders keep to [0, 1].
             colors: (n, 3) uint8 colour of each point.
 
         Raises:
@@ -193,8 +194,8 @@ class SemanticMap:
         patch_index = self._index("patches", patches, len(points_m), len(embeddings))
         unit = self._unit_rows(embeddings)
         patch_weights = self._array("weights", weights, (len(embeddings),))
-        if bool((patch_weights < 0).any()):
-            raise MapError("weights: must not be negative")
+        if bool(((patch_weights < 0) | (patch_weights > _MAX_WEIGHT)).any()):
+            raise MapError(f"weights: must lie in [0, {_MAX_WEIGHT:g}]")
         if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
             raise MapError(f"colors: must be ({len(points_m)}, 3) uint8, got {colors.shape} {colors.dtype}")
         if not len(coordinates):
@@ -456,9 +457,10 @@ class SemanticMap:
     ) -> Tensor:
         if values.shape != shape or not np.issubdtype(values.dtype, np.floating):
             raise MapError(f"{name}: must be {shape} floating point, got {values.shape} {values.dtype}")
-        if not np.isfinite(values).all():
-            raise MapError(f"{name}: has values that are not finite")
-        return torch.from_numpy(np.ascontiguousarray(values)).to(self._device, dtype)
+        tensor = torch.from_numpy(np.ascontiguousarray(values)).to(self._device, dtype)
+        if not bool(torch.isfinite(tensor).all()):  # After the cast, which turns what is too large into infinity.
+            raise MapError(f"{name}: has values that are not finite in {str(dtype).removeprefix('torch.')}")
+        return tensor
 
     def _index(self, name: str, values: NDArray[np.integer], length: int, bound: int) -> Tensor:
         if values.shape != (length,) or not np.issubdtype(values.dtype, np.integer):
@@ -468,10 +470,12 @@ class SemanticMap:
         return torch.from_numpy(values.astype(np.int64)).to(self._device)
 
     def _unit_rows(self, embeddings: NDArray[np.floating]) -> Tensor:
-        values = self._array("embeddings", embeddings, (len(embeddings), self.dimension))
-        if bool((torch.linalg.vector_norm(values, dim=1) == 0).any()):
+        values = self._array("embeddings", embeddings, (len(embeddings), self.dimension), torch.float64)
+        largest = values.abs().amax(dim=1, keepdim=True) if len(values) else values[:, :1]
+        if bool((largest == 0).any()):
             raise MapError("embeddings: a row has length 0")
-        return normalize(values, dim=1)
+        # Scaled first, so that squares neither overflow nor vanish whatever the row's length.
+        return normalize(values / largest, dim=1).to(torch.float32)
 
 
 def _check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: int) -> None:
@@ -497,13 +501,27 @@ def _check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses:
             raise MapError(f"array '{name}' is missing")
         if state[name].shape != shape:
             raise MapError(f"array '{name}' must have the shape {shape}, has {state[name].shape}")
+    for name, array in state.items():
+        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+            raise MapError(f"array '{name}' has values that are not finite")
+    for name in ("voxel_coordinates", "dense_slot", "hypothesis_id", "hypothesis_count", "instance_id", "next_instance_id"):
+        if not np.issubdtype(state[name].dtype, np.integer):
+            raise MapError(f"array '{name}' must be of an integer type, is {state[name].dtype}")
     next_id = int(state["next_instance_id"])
     for name, bound in (("dense_slot", n), ("instance_id", next_id)):
         values = state[name]
         if len(values) and not (values.min() >= 0 and values.max() < bound and len(np.unique(values)) == len(values)):
             raise MapError(f"array '{name}' must hold distinct values in [0, {bound})")
-    if len(np.unique(state["voxel_coordinates"], axis=0)) != n:
+    coordinates = state["voxel_coordinates"]
+    if n and np.abs(coordinates.astype(np.int64)).max() > MAX_COORDINATE:
+        raise MapError(f"array 'voxel_coordinates' goes beyond the map's range of +-{MAX_COORDINATE}")
+    if len(np.unique(coordinates, axis=0)) != n:
         raise MapError("array 'voxel_coordinates' holds a voxel twice")
-    held = state["hypothesis_id"]
+    held, counts = state["hypothesis_id"], state["hypothesis_count"]
     if not np.isin(held[held >= 0], state["instance_id"]).all():
         raise MapError("array 'hypothesis_id' names an instance that array 'instance_id' lacks")
+    if (counts < 0).any() or ((counts > 0) != (held >= 0)).any():
+        raise MapError("array 'hypothesis_count' must be positive where there is a hypothesis and 0 elsewhere")
+    for name in ("dense_weight", "instance_weight", "fused_evidence"):
+        if (state[name] < 0).any() or (name != "fused_evidence" and (state[name] == 0).any()):
+            raise MapError(f"array '{name}' must be positive")

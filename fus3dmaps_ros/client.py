@@ -18,7 +18,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.messages import to_pose
+from fus3dmaps_core.messages import stamp_ns, to_pose
 from fus3dmaps_core.query import RankedInstance
 from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.conversions import from_cloud, unpack_rgb
@@ -92,50 +92,66 @@ class MapperClient:
             raise QueryError(response.message)
         return response
 
-    def map_cloud(self, timeout_s: float = 30.0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    def map_cloud(self, since_ns: int = 0, timeout_s: float = 30.0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """The node's map: voxel centres (n, 3) in metres and their colours (n, 3).
 
+        Args:
+            since_ns: Oldest stamp that will do; the node first hands out the last map that anyone listened to.
+            timeout_s: Longest wait.
+
         Raises:
             QueryError: None is published in time.
         """
-        table = from_cloud(self._receive(PointCloud2, "map", timeout_s))
+        table = from_cloud(self._receive(PointCloud2, "map", since_ns, timeout_s))
         return np.stack([table[axis] for axis in "xyz"], axis=1), unpack_rgb(table["rgb"])
 
-    def camera_poses(self, timeout_s: float = 30.0) -> NDArray[np.float64]:
+    def camera_poses(self, since_ns: int = 0, timeout_s: float = 30.0) -> NDArray[np.float64]:
         """Poses T_world_camera (n, 4, 4) of the node's keyframes.
+
+        Args:
+            since_ns: Oldest stamp that will do.
+            timeout_s: Longest wait.
 
         Raises:
             QueryError: None is published in time.
         """
-        message = self._receive(PathMessage, "path", timeout_s)
+        message = self._receive(PathMessage, "path", since_ns, timeout_s)
         return np.array([to_pose(pose, "path") for pose in message.poses]).reshape(-1, 4, 4)
 
-    def _receive(self, message_type: Any, topic: str, timeout_s: float) -> Any:
-        """The latest message of one of the node's latched topics."""
+    def _receive(self, message_type: Any, topic: str, since_ns: int, timeout_s: float) -> Any:
+        """A message of one of the node's latched topics."""
         received: list[Any] = []
         subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, _LATCHED)
         deadline = time.monotonic() + timeout_s
-        while not received and time.monotonic() < deadline:
-            self._executor.spin_once(timeout_sec=0.2)
-        self._node.destroy_subscription(subscription)
-        if not received:
-            raise QueryError(f"nothing is published on {self._name}/{topic} within {timeout_s:.0f} s")
-        return received[-1]
+        try:
+            while time.monotonic() < deadline:
+                self._executor.spin_once(timeout_sec=0.2)
+                if received and stamp_ns(received[-1]) >= since_ns:
+                    return received[-1]
+        finally:
+            self._node.destroy_subscription(subscription)
+        raise QueryError(f"nothing new is published on {self._name}/{topic} within {timeout_s:.0f} s")
 
 
 def ranked_instances(response: QueryText.Response) -> list[RankedInstance]:
     """The instances of a reply, best first."""
     return [
         RankedInstance(
-            found.id,
-            found.prompt,
-            found.score,
-            found.weight,
-            *(np.array([point.x, point.y, point.z], np.float32) for point in (found.centroid, found.box_min, found.box_max)),
-            found.voxels,
+            id=found.id,
+            prompt=found.prompt,
+            score=found.score,
+            weight=found.weight,
+            centroid_m=_position(found.centroid),
+            box_min_m=_position(found.box_min),
+            box_max_m=_position(found.box_max),
+            voxels=found.voxels,
         )
         for found in response.instances
     ]
+
+
+def _position(point: Any) -> NDArray[np.float32]:
+    return np.array([point.x, point.y, point.z], np.float32)
 
 
 def similarity_points(response: QueryText.Response) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 from builtin_interfaces.msg import Duration, Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Vector3
@@ -19,6 +18,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
+from fus3dmaps_core.colors import similarity_colors
 from fus3dmaps_core.query import QueryAnswer, RankedInstance
 from fus3dmaps_core.semantic_map import InstanceSnapshot, VoxelSnapshot
 from fus3dmaps_msgs.msg import SemanticInstance
@@ -103,17 +103,6 @@ def unpack_rgb(packed: NDArray[np.float32]) -> NDArray[np.uint8]:
     """The inverse of :func:`pack_rgb`: (n, 3) uint8."""
     wide = np.ascontiguousarray(packed).view(np.uint32)
     return np.stack([wide >> 16 & 255, wide >> 8 & 255, wide & 255], axis=1).astype(np.uint8)
-
-
-def similarity_colors(similarity: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours (n, 3) from blue to red (turbo), spread over the range that the similarities (n,) span."""
-    if not len(similarity):
-        return np.empty((0, 3), np.uint8)
-    low, high = float(similarity.min()), float(similarity.max())
-    shares = (similarity.astype(np.float64) - low) / (high - low) if high > low else np.zeros(len(similarity))
-    levels = np.round(255 * shares).astype(np.uint8)
-    bgr = cv2.applyColorMap(levels.reshape(-1, 1), cv2.COLORMAP_TURBO).reshape(-1, 3)
-    return np.ascontiguousarray(bgr[:, ::-1])
 
 
 def to_similarity_cloud(header: Header, answer: QueryAnswer) -> PointCloud2:

@@ -21,6 +21,7 @@ from rich.console import Console
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.errors import Fus3dmapsError, QueryError, RecordingError
+from fus3dmaps_core.messages import stamp_ns
 from fus3dmaps_core.query import RankedInstance
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
@@ -29,9 +30,9 @@ from fus3dmaps_core.sources.furnished_room import FurnishedRoom
 from fus3dmaps_ros.client import MapperClient, ranked_instances, similarity_points
 
 ROOM_PROMPTS = {
-    "a furry pet that purrs": "cat",
-    "a hot drink for the morning": "coffee",
-    "a vehicle that flies into space": "rocket",
+    "a pet that meows": "cat",
+    "a drink that wakes you up": "coffee",
+    "a two-wheeled vehicle with an engine": "motorcycle",
 }
 """What the room is asked for, and the object that is meant. None is a class name of the networks."""
 
@@ -160,8 +161,7 @@ def _follow(
             console.print(f"  while mapping: {error}", markup=False)
             newer = newest_ns
         else:
-            stamp = reply.similarity.header.stamp
-            newer = stamp.sec * 1_000_000_000 + stamp.nanosec
+            newer = stamp_ns(reply.similarity)
             best = ranked_instances(reply)
             where = _place(best[0]) if best else "no instance yet"
             console.print(
@@ -177,8 +177,9 @@ def _ask(
     client: MapperClient, prompts: Sequence[str], room: FurnishedRoom | None, config: Config, out: Path, console: Console
 ) -> bool:
     all_right = True
-    points_m, colors = client.map_cloud()
-    camera_poses = client.camera_poses()
+    newest_ns = stamp_ns(client.ask(prompts[:1], top_k=1).similarity)
+    points_m, colors = client.map_cloud(newest_ns)
+    camera_poses = client.camera_poses(newest_ns)
     for prompt in prompts:
         reply = client.ask([prompt], top_k=3, publish=True)
         found = ranked_instances(reply)

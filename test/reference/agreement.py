@@ -148,6 +148,15 @@ def _assert_same_snapshots(engine: SemanticMap, keys: list[Key], reference: Refe
     assert_close(instances.boxes_max_m, [high for _, high in boxes], rtol=1e-5, atol=1e-6)
 
 
+def assert_same_bytes(first: dict[str, np.ndarray], second: dict[str, np.ndarray]) -> None:
+    """Compare two exported states bit for bit."""
+    assert first.keys() == second.keys()
+    for name, array in first.items():
+        assert array.dtype == second[name].dtype, name
+        assert array.shape == second[name].shape, name
+        assert array.tobytes() == second[name].tobytes(), name
+
+
 class KnownTexts:
     """A text encoder whose prompts are names of given vectors."""
 

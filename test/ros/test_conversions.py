@@ -6,7 +6,7 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from rclpy.serialization import deserialize_message, serialize_message
@@ -35,6 +35,7 @@ def test_a_duration_carries_over_whole_seconds(seconds, expected) -> None:
     assert (message.sec, message.nanosec) == expected
 
 
+@settings(max_examples=30)
 @given(
     st.integers(0, 40).flatmap(
         lambda n: st.tuples(

@@ -43,8 +43,8 @@ class LiteCropEncoder:
         x0, y0, x1, y1 = (int(value) for value in box)
         pad_x, pad_y = int(self._padding * (x1 - x0)), int(self._padding * (y1 - y0))
         window = np.s_[max(0, y0 - pad_y) : min(height, y1 + pad_y), max(0, x0 - pad_x) : min(width, x1 + pad_x)]
-        # The neighbours of an object would vote for themselves: outside the mask stands the colour that the network reads as 0.
+        # The neighbours of an object would vote for themselves: outside the mask stands what the network reads as zero.
         crop = np.where(mask[window][..., None], rgb[window], np.uint8(MEAN))
         shrinks = max(crop.shape[:2]) > INPUT_SIZE
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR
-        return cv2.resize(crop, (INPUT_SIZE, INPUT_SIZE), interpolation=interpolation).astype(np.uint8, copy=False)
+        return np.asarray(cv2.resize(crop, (INPUT_SIZE, INPUT_SIZE), interpolation=interpolation), np.uint8)

