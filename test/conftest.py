@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import fus3dmaps_core  # noqa: F401, I001  (first: it settles how torch's threads wait)
 import numpy as np
 import pytest
 import torch

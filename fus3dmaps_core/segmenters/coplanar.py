@@ -1,13 +1,14 @@
 """Joins neighbouring segments that lie in one plane.
 
 Inverse depth is affine in pixel coordinates on a plane, 1/z = a u + b v + c, whatever the camera's focal length. Segments
-are joined as long as one such fit explains both sides to within a relative depth error, the best-fitting pair first. All sums
-that a fit needs are additive, so that a union costs no look at the pixels.
+are joined as long as one such fit explains both sides to within a relative depth error, the best-fitting pair first. All
+sums that a fit needs are additive, so that a union costs no look at the pixels.
 """
 
 from __future__ import annotations
 
 import heapq
+import math
 from itertools import count
 
 import numpy as np
@@ -27,13 +28,13 @@ class _Moments:
 
     def plane(self) -> NDArray[np.float64]:
         # The ridge only matters for pixels in a line, through which many planes go.
-        ridge = 1e-9 * np.trace(self.normal) * np.eye(3)
+        ridge = 1e-9 * float(np.trace(self.normal)) * np.eye(3)
         return np.asarray(np.linalg.solve(self.normal + ridge, self.right), np.float64)
 
     def error(self, plane: NDArray[np.float64]) -> float:
         """Root mean square of the relative error of depth under a plane."""
         square = plane @ self.normal @ plane - 2 * plane @ self.right + self.readings
-        return float(np.sqrt(max(square, 0.0) / self.readings))
+        return math.sqrt(max(float(square), 0.0) / self.readings)
 
 
 def join_coplanar(

@@ -27,7 +27,7 @@ def filter_masks(masks: Masks, config: SegmenterConfig) -> Masks:
     """
     if not len(masks):
         return masks
-    areas = masks.masks.sum(axis=(1, 2))
+    areas = np.array([np.count_nonzero(mask) for mask in masks.masks])
     kept = [
         row
         for row in np.argsort(-areas, kind="stable")

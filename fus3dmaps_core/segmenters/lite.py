@@ -1,8 +1,8 @@
 """The default segmenter ``lite``: classical over-segmentation, planes by depth, and the detector's boxes.
 
 Three kinds of proposals, which overlap: the segments of Felzenszwalb and Huttenlocher (2004) on colour, at a quarter of the
-pixels; planes joined from neighbouring segments by depth, which makes tables and floors whole that texture has shattered; and
-the segments that fill a detected box. No learned segmentation: parts of objects and groups of them are to be expected.
+pixels; planes joined from neighbouring segments by depth, which makes tables and floors whole that texture has shattered;
+and the segments that fill a detected box. No learned segmentation: parts of objects and groups of them are to be expected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ _MIN_SCORE = 0.2
 _MAX_BOX_IOU = 0.5
 _INSIDE = 0.7
 _MIN_FILL = 0.2
-_DUPLICATE_IOU = 0.85
+_SAME_IOU = 0.85
+_MIN_RADIUS_PX = 3.0
 _DEPTH_STEP = 1.2
 
 
@@ -53,18 +54,23 @@ class LiteSegmenter:
         depth = np.asarray(cv2.resize(depth_m, size, interpolation=cv2.INTER_NEAREST), np.float32)
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
         labels = felzenszwalb(small, scale=_SCALE, sigma=_SIGMA, min_size=_MIN_SEGMENT_PX).astype(np.int32)
-        n = int(labels.max()) + 1
 
-        unions = [np.array([label]) for label in range(n)] + join_coplanar(labels, depth, _PLANE_ERROR)
-        chosen = np.zeros((len(unions), n), bool)
+        areas = np.bincount(labels.ravel())
+        radii = _inner_radii_px(labels)
+        unions = [np.array([label]) for label in np.flatnonzero(radii >= _MIN_RADIUS_PX)]
+        # A plane that one of its segments all but fills says nothing new.
+        unions += [
+            union
+            for union in join_coplanar(labels, depth, _PLANE_ERROR)
+            if areas[union].max() < _SAME_IOU * areas[union].sum()
+        ]
+        filled = self._filled_boxes(rgb, labels, depth)
+        chosen = np.zeros((len(unions), len(areas)), bool)
         for row, union in enumerate(unions):
             chosen[row, union] = True
-        masks = _distinct(np.concatenate([self._filled_boxes(rgb, labels, depth), chosen[:, labels]]))
-        if factor == 1.0:
-            return Masks.from_masks(masks)
-        columns = (np.arange(width) * size[0]) // width
-        rows = (np.arange(height) * size[1]) // height
-        return Masks.from_masks(masks[:, rows[:, None], columns[None, :]])
+        for mask in filled:
+            chosen = chosen[_iou_with_unions(mask, labels, chosen, areas) < _SAME_IOU]
+        return _enlarged(np.concatenate([filled, chosen[:, labels]]), height, width)
 
     def _filled_boxes(
         self, rgb: NDArray[np.uint8], labels: NDArray[np.int32], depth_m: NDArray[np.float32]
@@ -122,14 +128,31 @@ def _background_depth_m(depth_m: NDArray[np.float32]) -> float:
     return float(readings[split]) if near[split] > _DEPTH_STEP * far[split] else float("inf")
 
 
-def _distinct(masks: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The masks without those that nearly equal an earlier one."""
-    flat = masks.reshape(len(masks), -1).astype(np.float32)
-    shared = flat @ flat.T
-    areas = np.diag(shared)
-    near = shared > _DUPLICATE_IOU * (areas[:, None] + areas[None, :] - shared)
-    kept: list[int] = []
-    for row in range(len(masks)):
-        if not near[row, kept].any():
-            kept.append(row)
-    return masks[kept]
+def _inner_radii_px(labels: NDArray[np.int32]) -> NDArray[np.float32]:
+    """(n,) float32, radius of the largest disc inside each segment, about; slivers along edges have a small one."""
+    interior = np.ones(labels.shape, np.uint8)
+    interior[:, 1:] &= labels[:, 1:] == labels[:, :-1]
+    interior[1:] &= labels[1:] == labels[:-1]
+    radii = np.zeros(int(labels.max()) + 1, np.float32)
+    np.maximum.at(radii, labels, cv2.distanceTransform(interior, cv2.DIST_L2, 3))
+    return radii
+
+
+def _iou_with_unions(
+    mask: NDArray[np.bool_], labels: NDArray[np.int32], chosen: NDArray[np.bool_], areas: NDArray[np.int_]
+) -> NDArray[np.float64]:
+    """Intersection over union of a mask with unions of segments; ``chosen`` is (unions, segments)."""
+    shared = chosen @ np.bincount(labels[mask], minlength=len(areas))
+    return np.asarray(shared / (mask.sum() + chosen @ areas - shared), np.float64)
+
+
+def _enlarged(masks: NDArray[np.bool_], height: int, width: int) -> Masks:
+    """Masks at another size, each pixel taking the nearest one's value."""
+    small_height, small_width = masks.shape[1:]
+    columns = np.arange(width) * small_width // width
+    rows = np.arange(height) * small_height // height
+    bounds = np.array([cv2.boundingRect(mask.view(np.uint8)) for mask in masks], np.int64).reshape(-1, 4)
+    bounds[:, 2:] += bounds[:, :2]
+    # The first pixel that takes its value from column x is ceil(x * width / small_width), and so for rows.
+    grown = -(-bounds * (width, height, width, height) // (small_width, small_height, small_width, small_height))
+    return Masks(masks[:, :, columns][:, rows], grown.astype(np.int32))

@@ -96,21 +96,6 @@ def test_packed_colour_has_red_in_the_third_byte() -> None:
     assert packed == bytes([3, 2, 1, 0])
 
 
-def test_similarity_colours_go_from_blue_to_red() -> None:
-    colors = conversions.similarity_colors(np.array([0.21, 0.2, 0.3, 0.25], np.float32)).astype(int)
-    low, high, middle = colors[1], colors[2], colors[3]
-    assert low[2] > low[0]
-    assert high[0] > high[2]
-    assert middle[1] > max(middle[0], middle[2])
-
-
-@pytest.mark.parametrize("similarity", [[], [0.5], [0.5, 0.5]])
-def test_similarities_without_a_span_have_a_colour(similarity) -> None:
-    colors = conversions.similarity_colors(np.array(similarity, np.float32))
-    assert colors.shape == (len(similarity), 3)
-    assert len(np.unique(colors, axis=0)) <= 1
-
-
 def test_the_similarity_cloud_has_its_fields_even_when_empty() -> None:
     answer = QueryAnswer("dense", np.array([[1, 2, 3]], np.float32), np.array([0.5], np.float32), [])
     names = [field.name for field in conversions.to_similarity_cloud(HEADER, answer).fields]

@@ -62,8 +62,8 @@ class WeightFile:
             raise EncoderError(message) from None
         if found != self.sha256:
             raise EncoderError(
-                f"encoder 'lite': '{path}' is not what the pip package '{self.package}' {self.version} brings: its sha256 is "
-                f"{found}, not {self.sha256}; {hint}"
+                f"encoder 'lite': '{path}' is not what the pip package '{self.package}' {self.version} brings: its sha256 "
+                f"is {found}, not {self.sha256}; {hint}"
             )
         return path
 
