@@ -23,6 +23,8 @@ _TEXT_COLOR = (40, 40, 48)
 _ELEVATION_RAD = np.deg2rad(52.0)
 _FIELD_OF_VIEW_RAD = np.deg2rad(40.0)
 _HEADROOM_M = 0.35
+_IN_VIEW_COS = np.cos(np.deg2rad(25.0))
+_FILL = 0.92
 _CUBE_CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
 _CUBE_TRIANGLES = np.array(
     [
@@ -60,12 +62,12 @@ def render_answer(
     camera_poses: NDArray[np.float64],
     voxel_size_m: float,
     title: str,
-    panel_size: tuple[int, int] = (960, 720),
+    panel_size: tuple[int, int] = (960, 640),
 ) -> NDArray[np.uint8]:
     """Draw a map twice from one viewpoint: in its own colours with the camera's path, and coloured by similarity.
 
-    The viewpoint is behind and above the cameras, along their mean line of sight, so that what they saw faces the viewer;
-    whatever is well above them is cut away, as the roof of a doll's house.
+    The viewpoint is behind and above the cameras that looked at the best answer, along their mean line of sight, so that
+    what they saw faces the viewer; whatever is well above them is cut away, as the roof of a doll's house.
 
     Args:
         map_points_m: (n, 3) centres of all voxels, map frame.
@@ -81,7 +83,7 @@ def render_answer(
     Returns:
         (H, W, 3) uint8 RGB.
     """
-    up, forward = _orientation(camera_poses)
+    up, forward = _orientation(camera_poses, instances[0].centroid_m if instances else None)
     ceiling = camera_poses[:, :3, 3] @ up
     limit = ceiling.max() + _HEADROOM_M if len(ceiling) else np.inf
     kept, kept_similar = map_points_m @ up <= limit, points_m @ up <= limit
@@ -138,11 +140,19 @@ def write_ply(path: Path, points_m: NDArray[np.float32], similarity: NDArray[np.
         raise StorageError(f"cannot write points '{path}': the name must end in .ply and the directory be writable")
 
 
-def _orientation(camera_poses: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _orientation(
+    camera_poses: NDArray[np.float64], target_m: NDArray[np.float32] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Up and mean horizontal line of sight: cameras are carried upright, whatever axis the map frame calls up."""
     up = -camera_poses[:, :3, 1].sum(axis=0) if len(camera_poses) else np.zeros(3)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
-    for candidate in (camera_poses[:, :3, 2].sum(axis=0), *np.eye(3)):
+    sights = camera_poses[:, :3, 2]
+    candidates = [sights.sum(axis=0), *np.eye(3)]
+    if target_m is not None:
+        towards = np.asarray(target_m, np.float64) - camera_poses[:, :3, 3]
+        towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-9)
+        candidates.insert(0, sights[np.einsum("nc,nc->n", sights, towards) > _IN_VIEW_COS].sum(axis=0))
+    for candidate in candidates:
         forward = candidate - up * (candidate @ up)
         if np.linalg.norm(forward) > 0.1:
             break
@@ -152,17 +162,26 @@ def _orientation(camera_poses: NDArray[np.float64]) -> tuple[NDArray[np.float64]
 def _frame_view(
     points_m: NDArray[np.float32], up: NDArray[np.float64], forward: NDArray[np.float64], width: int, height: int
 ) -> _View:
-    """A camera that looks down on the points and has nearly all of them in the picture."""
+    """A camera that looks down on the points, as near as it can be with nearly all of them in the picture."""
     sight = np.cos(_ELEVATION_RAD) * forward - np.sin(_ELEVATION_RAD) * up
     right = np.cross(sight, up)
     right /= np.linalg.norm(right)
     R = np.stack([right, np.cross(sight, right), sight])
     local = points_m.astype(np.float64) @ R.T
     low, high = np.percentile(local, [0.5, 99.5], axis=0)
-    center, half = (low + high) / 2, (high - low) / 2
-    focal_px = 0.5 * height / np.tan(_FIELD_OF_VIEW_RAD / 2)
-    distance = max(half[0] * focal_px / (0.46 * width), half[1] * focal_px / (0.46 * height)) + half[2]
-    return _View(R, np.array([0.0, 0.0, distance]) - center, float(focal_px), width, height)
+    local = local[np.all((local >= low) & (local <= high), axis=1)]
+    local = local if len(local) else (low + high)[None] / 2
+    focal_px = float(0.5 * height / np.tan(_FIELD_OF_VIEW_RAD / 2))
+    center = (local.min(axis=0) + local.max(axis=0)) / 2
+    near, far = 0.1 - (local[:, 2] - center[2]).min(), 1.0 + 20.0 * float(np.ptp(local, axis=0).max())
+    for _ in range(30):
+        distance = (near + far) / 2
+        x, y = ((local - center)[:, :2] * focal_px / (local[:, 2:] - center[2] + distance)).T
+        # Perspective shifts the middle of what is seen: the camera moves sideways with it.
+        center[:2] += [(x.min() + x.max()) / 2 * distance / focal_px, (y.min() + y.max()) / 2 * distance / focal_px]
+        fits = np.ptp(x) <= _FILL * width and np.ptp(y) <= _FILL * height
+        near, far = (near, distance) if fits else (distance, far)
+    return _View(R, np.array([0.0, 0.0, far]) - center, focal_px, width, height)
 
 
 def _cast(points_m: NDArray[np.float32], colors: NDArray[np.uint8], voxel_size_m: float, view: _View) -> NDArray[np.uint8]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import yaml
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -146,7 +147,7 @@ def query(
     )
     text_encoder = load_text_encoder(info.encoder, "cpu")
     answer = answer_query(semantic_map, text_encoder, request, info.logit_scale)
-    _print_answer(answer.instances, info.map_frame, len(prompts) > 1, as_json)
+    _print_answer(answer.instances, prompts, info.map_frame, as_json)
     if png is not None:
         from fus3dmaps_core.render import render_answer, write_png
 
@@ -207,7 +208,7 @@ def ask(
     with MapperClient(node_name) as client:
         client.wait_until_ready(timeout)
         reply = client.ask(prompts, negative_prompts=negative or (), layer=layer, top_k=top, publish=True, timeout_s=timeout)
-    _print_answer(ranked_instances(reply), reply.similarity.header.frame_id, len(prompts) > 1, as_json)
+    _print_answer(ranked_instances(reply), prompts, reply.similarity.header.frame_id, as_json)
 
 
 @app.command()
@@ -253,16 +254,19 @@ def _config(params_file: Path | None, settings: list[str] | None) -> Config:
     return config.with_values(values)
 
 
-def _print_answer(instances: Sequence[RankedInstance], frame: str, with_prompt: bool, as_json: bool) -> None:
+def _print_answer(instances: Sequence[RankedInstance], prompts: Sequence[str], frame: str, as_json: bool) -> None:
     if as_json:
-        print(json.dumps([_as_json(found, with_prompt) for found in instances]))
+        print(json.dumps([_as_json(found, len(prompts) > 1) for found in instances]))
         return
-    table = Table("rank", "prompt", "score", "x", "y", "z", "size [m]", "voxels", "id", title=f"metres, frame {frame}")
-    for rank, found in enumerate(instances, start=1):
-        size = " x ".join(f"{edge:.2f}" for edge in found.box_max_m - found.box_min_m)
-        place = (f"{value:.2f}" for value in found.centroid_m)
-        table.add_row(str(rank), found.prompt, f"{found.score:.3f}", *place, size, str(found.voxels), str(found.id))
-    _out.print(table)
+    for prompt in prompts:
+        table = Table(title=f"{escape(prompt)}   (metres, frame {escape(frame)})", title_justify="left")
+        for heading in ("rank", "score", "position", "size", "voxels", "id"):
+            table.add_column(heading, no_wrap=True)
+        for rank, found in enumerate((found for found in instances if found.prompt == prompt), start=1):
+            place = "  ".join(f"{value:.2f}" for value in found.centroid_m)
+            size = " x ".join(f"{edge:.2f}" for edge in found.box_max_m - found.box_min_m)
+            table.add_row(str(rank), f"{found.score:.3f}", place, size, str(found.voxels), str(found.id))
+        _out.print(table)
 
 
 def _as_json(found: RankedInstance, with_prompt: bool) -> dict[str, Any]:
@@ -287,7 +291,7 @@ def _need_ros() -> None:
 
 
 @contextmanager
-def _progress(label: str) -> Iterator[Any]:
+def _progress(label: str) -> Iterator[Callable[[int, int], None]]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -295,9 +299,17 @@ def _progress(label: str) -> Iterator[Any]:
         TaskProgressColumn(),
         TimeRemainingColumn(),
     )
-    with Progress(*columns, console=_log) as progress:
-        task = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+    progress = Progress(*columns, console=_log)
+    task = progress.add_task(label, total=None)
+
+    def update(done: int, total: int) -> None:
+        progress.start()  # Not before there is something to show: a refusal is to stand alone.
+        progress.update(task, completed=done, total=total)
+
+    try:
+        yield update
+    finally:
+        progress.stop()
 
 
 if __name__ == "__main__":

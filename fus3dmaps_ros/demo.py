@@ -81,7 +81,7 @@ def run_demo(recording: Path | None, prompts: Sequence[str], out: Path, console:
     with _process("node", node, out / "node.log", environment) as mapper, MapperClient() as client:
         console.print("node: loading models")
         _wait_until_ready(client, mapper, out / "node.log")
-        console.print(f"player: {images} images from {recording}", markup=False)
+        console.print(f"player: {images} images from {recording}", markup=False, soft_wrap=True)
         with _process("player", player, out / "player.log", environment) as playing:
             _follow(client, mapper, playing, asked[0], end_ns, out, console)
         return _ask(client, asked, room, config, out, console)
@@ -150,7 +150,7 @@ def _follow(
     console: Console,
 ) -> None:
     """Ask while the node maps, until the map has the recording's last frame or grows no more."""
-    newest_ns, changed = 0, time.monotonic()
+    newest_ns, changed, last = 0, time.monotonic(), ""
     while newest_ns < end_ns:
         _check_alive(mapper, "node", out / "node.log")
         _check_alive(playing, "player", out / "player.log")
@@ -158,7 +158,9 @@ def _follow(
         try:
             reply = client.ask([prompt], top_k=1)
         except QueryError as error:
-            console.print(f"  while mapping: {error}", markup=False)
+            if str(error) != last:
+                console.print(f"  while mapping: {error}", markup=False, soft_wrap=True)
+            last = str(error)
             newer = newest_ns
         else:
             newer = stamp_ns(reply.similarity)
@@ -185,7 +187,11 @@ def _ask(
         found = ranked_instances(reply)
         console.print(f'\n"{prompt}"', markup=False, style="bold")
         for rank, instance in enumerate(found, start=1):
-            console.print(f"  {rank}. score {instance.score:.3f} {_place(instance)}, {instance.voxels} voxels", markup=False)
+            console.print(
+                f"  {rank}. score {instance.score:.3f} {_place(instance)}, {instance.voxels} voxels",
+                markup=False,
+                soft_wrap=True,
+            )
         expected = ROOM_PROMPTS.get(prompt) if room is not None else None
         if room is not None and expected is not None:
             right = bool(found) and _is_object(found[0], room, expected)
@@ -197,7 +203,7 @@ def _ask(
             points_m, colors, voxel_points_m, similarity, found, camera_poses, config.map.voxel_size_m, f'"{prompt}"'
         )
         write_png(path, picture)
-        console.print(f"  {path}", markup=False)
+        console.print(f"  {path}", markup=False, soft_wrap=True)
     return all_right
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import fus3dmaps_core  # noqa: F401, I001  (first: it settles how torch's threads wait)
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, settings
+
+import fus3dmaps_core  # noqa: F401  (before any test imports torch: it settles how idle threads wait)
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 
@@ -16,7 +16,6 @@ settings.register_profile(
     "fus3dmaps", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
 settings.load_profile("fus3dmaps")
-torch.set_num_threads(2)
 
 
 @pytest.fixture(scope="session")

@@ -9,12 +9,12 @@ from fus3dmaps_core.encoders.lite.detector import Detections
 from fus3dmaps_core.encoders.lite.vocabulary import COCO_CATEGORIES
 
 _SCORE_GAIN = 2.0  # The detector is underconfident: a score of a half is as good as certain.
-_MIN_CROP_IOU = 0.4
+_NO_MATCH_IOU, _FULL_MATCH_IOU = 0.2, 0.7
 _SOFT_MARGIN = 0.3
 
 
 def crop_evidence(detections: Detections, boxes: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Evidence for crops: a detection speaks of every box that it overlaps well.
+    """Evidence for crops: a detection speaks of a box the more, the better the two coincide.
 
     Args:
         detections: Detections of the image.
@@ -25,9 +25,10 @@ def crop_evidence(detections: Detections, boxes: NDArray[np.int32]) -> NDArray[n
     """
     evidence = np.zeros((len(boxes), COCO_CATEGORIES), np.float32)
     strengths = np.minimum(1.0, _SCORE_GAIN * detections.scores)
-    overlaps = box_iou(boxes.astype(np.float32), detections.boxes) > _MIN_CROP_IOU
-    for label, strength, overlap in zip(detections.labels, strengths, overlaps.T, strict=True):
-        evidence[:, label] = np.maximum(evidence[:, label], strength * overlap)
+    overlaps = box_iou(boxes.astype(np.float32), detections.boxes)
+    matches = np.clip((overlaps - _NO_MATCH_IOU) / (_FULL_MATCH_IOU - _NO_MATCH_IOU), 0.0, 1.0)
+    for label, strength, match in zip(detections.labels, strengths, matches.T, strict=True):
+        evidence[:, label] = np.maximum(evidence[:, label], strength * match)
     return evidence
 
 

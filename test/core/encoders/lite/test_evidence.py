@@ -34,12 +34,13 @@ def test_iou_counts_pixels(first, second):
     assert box_iou(boxes[0], boxes[1]).item() == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_detection_speaks_of_crops_that_it_overlaps_well():
-    boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 30], [100, 100, 110, 110]], np.int32)
+def test_a_detection_speaks_of_crops_as_far_as_they_coincide():
+    boxes = np.array([[0, 0, 10, 10], [0, 0, 10, 20], [0, 0, 10, 60], [100, 100, 110, 110]], np.int32)
     evidence = crop_evidence(detections((CUP, 0.3, (0, 0, 10, 10)), (CUP, 0.2, (1, 0, 10, 10))), boxes)
-    assert evidence.shape == (3, 91)
+    assert evidence.shape == (4, 91)
     assert evidence[0, CUP] == pytest.approx(0.6)  # twice the score of the better one
-    assert np.count_nonzero(evidence) == 1  # the second box overlaps by a third only
+    assert evidence[1, CUP] == pytest.approx(0.6 * (0.5 - 0.2) / 0.5)  # an IoU of a half
+    assert np.count_nonzero(evidence) == 2
     assert crop_evidence(detections((CUP, 0.9, (0, 0, 10, 10))), boxes)[0, CUP] == 1.0
 
 
