@@ -39,6 +39,9 @@ ROOM_PROMPTS = {
 RECORDING_PROMPTS = ("something to drink from", "a place to sit", "a display that shows pictures")
 """What a recording of the user's is asked for if nothing else is said."""
 
+NODE_PARAMETERS: dict[str, str] = {}
+"""Parameters of the node beside those that the demonstration itself needs."""
+
 _MODELS_TIMEOUT_S = 180.0
 _PATIENCE_S = 20.0  # Without a newer frame in the map for so long after the last was played, the node has done all it will.
 
@@ -76,7 +79,9 @@ def run_demo(recording: Path | None, prompts: Sequence[str], out: Path, console:
     environment.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     os.environ.update(environment)
     # The queue holds the whole recording, so that a slow machine maps the same frames as a quick one.
-    node = [sys.executable, "-m", "fus3dmaps_ros.cli", "node", "--ros-args", "-p", f"node.queue_size:={max(images, 1)}"]
+    parameters = {"node.queue_size": str(max(images, 1)), **NODE_PARAMETERS}
+    settings = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
+    node = [sys.executable, "-m", "fus3dmaps_ros.cli", "node", "--ros-args", *settings]
     player = [sys.executable, "-m", "fus3dmaps_ros.cli", "play", str(recording)]
     with _process("node", node, out / "node.log", environment) as mapper, MapperClient() as client:
         console.print("node: loading models")

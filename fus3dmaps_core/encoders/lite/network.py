@@ -16,7 +16,6 @@ from fus3dmaps_core.encoders.lite.weights import CLASSIFIER
 FEATURE_STRIDE = 32
 FEATURE_WIDTH = 1280
 CLASSES = 1000
-INPUT_SIZE = 224
 
 MEAN = 127.0
 _STD = 128.0
