@@ -16,8 +16,9 @@ from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.motion import KeyframeGate
 from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sample_pixels, unproject
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.filtering import filter_masks
-from fus3dmaps_core.segmenters.protocols import Masks, Segmenter
+from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
 from fus3dmaps_core.semantic_map import SemanticMap
 

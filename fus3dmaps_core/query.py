@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.encoders.protocols import TextEncoder
 from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.semantic_map import LAYERS, InstanceSnapshot, LayerSimilarity, SemanticMap
+from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.snapshots import InstanceSnapshot, LayerSimilarity
 
 DEFAULT_LAYER = "fused_instances"
 _MAX_PROMPT_LENGTH = 4096

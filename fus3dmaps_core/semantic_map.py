@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
@@ -23,90 +21,22 @@ from fus3dmaps_core.layers.dense import DenseLayer
 from fus3dmaps_core.layers.fusion import fuse_instances
 from fus3dmaps_core.layers.instances import InstanceLayer
 from fus3dmaps_core.layers.similarity import dense_similarity, fused_dense_similarity, instance_similarity
+from fus3dmaps_core.map_input import (
+    check_state,
+    float_tensor,
+    index_tensor,
+    unit_rows,
+    voxel_coordinates,
+    weight_tensor,
+)
+from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, LayerSimilarity, VoxelSnapshot, snapshot_instances
 from fus3dmaps_core.voxels.columns import Column
-from fus3dmaps_core.voxels.hash import MAX_COORDINATE, VoxelHash, pack
+from fus3dmaps_core.voxels.hash import VoxelHash, pack
 
 LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
 """Names of the layers that can be queried."""
 
-_MAX_WEIGHT = 1e6  # Far from where sums in float32 would overflow.
 _UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
-
-
-@dataclass(frozen=True)
-class FusionReport:
-    """What one fusion did.
-
-    Attributes:
-        instances: Instances alive.
-        updated: Instances whose fused embedding was replaced.
-        voxels: Voxels of the map.
-        duration_s: Wall time, seconds.
-    """
-
-    instances: int
-    updated: int
-    voxels: int
-    duration_s: float
-
-
-@dataclass(frozen=True)
-class VoxelSnapshot:
-    """A copy of the map's voxels, by slot.
-
-    Attributes:
-        centers_m: (n, 3) float32 voxel centres in the map frame, metres.
-        colors: (n, 3) uint8, mean colour in the newest dense keyframe that hit the voxel; grey if none did.
-        top_instance: (n,) int64 id of the hypothesis with the highest count, -1 without one.
-        top_count: (n,) int64 count of that hypothesis, 0 without one.
-        dense_weight: (n,) float32 w^D, 0 without a dense embedding.
-    """
-
-    centers_m: NDArray[np.float32]
-    colors: NDArray[np.uint8]
-    top_instance: NDArray[np.int64]
-    top_count: NDArray[np.int64]
-    dense_weight: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class InstanceSnapshot:
-    """A copy of the instances alive, by ascending id. An instance occupies the voxels whose top hypothesis it is.
-
-    Attributes:
-        ids: (n,) int64.
-        weights: (n,) float64 w_id, observations behind the embedding.
-        hypothesis_voxels: (n,) int64 |V_id|, voxels that hold it as any of their hypotheses.
-        voxel_counts: (n,) int64, voxels that it occupies.
-        centroids_m: (n, 3) float32, mean of the centres of these, weighted by count; NaN if there is none.
-        boxes_min_m: (n, 3) float32, smallest corner of these voxels; NaN if there is none.
-        boxes_max_m: (n, 3) float32, largest corner; NaN if there is none.
-    """
-
-    ids: NDArray[np.int64]
-    weights: NDArray[np.float64]
-    hypothesis_voxels: NDArray[np.int64]
-    voxel_counts: NDArray[np.int64]
-    centroids_m: NDArray[np.float32]
-    boxes_min_m: NDArray[np.float32]
-    boxes_max_m: NDArray[np.float32]
-
-
-@dataclass(frozen=True)
-class LayerSimilarity:
-    """Similarities of one layer with some texts, and the map they belong to, all of one moment.
-
-    Attributes:
-        slots: (n,) int64 slots that have the layer, ascending.
-        cosines: (n, p) float32.
-        voxels: The map's voxels.
-        instances: The map's instances.
-    """
-
-    slots: NDArray[np.int64]
-    cosines: NDArray[np.float32]
-    voxels: VoxelSnapshot
-    instances: InstanceSnapshot
 
 
 class SemanticMap:
@@ -190,12 +120,10 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        coordinates = self._coordinates(points_m)
-        patch_index = self._index("patches", patches, len(points_m), len(embeddings))
-        unit = self._unit_rows(embeddings)
-        patch_weights = self._array("weights", weights, (len(embeddings),))
-        if bool(((patch_weights < 0) | (patch_weights > _MAX_WEIGHT)).any()):
-            raise MapError(f"weights: must lie in [0, {_MAX_WEIGHT:g}]")
+        coordinates = voxel_coordinates(points_m, self.config.voxel_size_m, self._device)
+        patch_index = index_tensor("patches", patches, len(points_m), len(embeddings), self._device)
+        unit = unit_rows(embeddings, self.dimension, self._device)
+        patch_weights = weight_tensor(weights, len(embeddings), self._device)
         if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
             raise MapError(f"colors: must be ({len(points_m)}, 3) uint8, got {colors.shape} {colors.dtype}")
         if not len(coordinates):
@@ -226,9 +154,9 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        coordinates = self._coordinates(points_m)
-        proposal_index = self._index("proposals", proposals, len(points_m), len(embeddings))
-        unit = self._unit_rows(embeddings)
+        coordinates = voxel_coordinates(points_m, self.config.voxel_size_m, self._device)
+        proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
+        unit = unit_rows(embeddings, self.dimension, self._device)
         ids = np.full(len(embeddings), -1, np.int64)
         if not len(coordinates):
             return ids
@@ -256,7 +184,7 @@ class SemanticMap:
         Raises:
             MapError: The position is not three finite numbers.
         """
-        center = self._array("center_m", center_m, (3,), torch.float64)
+        center = float_tensor("center_m", center_m, (3,), self._device, torch.float64)
         if self.window_radius_m <= 0:
             return 0
         with self._lock:
@@ -316,7 +244,7 @@ class SemanticMap:
         """
         if layer not in LAYERS:
             raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
-        unit = self._unit_rows(texts)
+        unit = unit_rows(texts, self.dimension, self._device)
         with self._lock:
             self._reserve()
             count = len(self._hash)
@@ -375,7 +303,7 @@ class SemanticMap:
         Raises:
             MapError: An array is missing or its shape does not fit this map; the map keeps what it had.
         """
-        _check_state(state, self.dimension, self.config.max_hypotheses)
+        check_state(state, self.dimension, self.config.max_hypotheses)
         tensors = {name: torch.from_numpy(np.array(array)).to(self._device) for name, array in state.items()}
         with self._lock:
             self._clear()
@@ -417,111 +345,7 @@ class SemanticMap:
         return (self._hash.coordinates(slots).to(torch.float64) + 0.5) * self.config.voxel_size_m
 
     def _snapshot_instances(self, voxels: VoxelSnapshot) -> InstanceSnapshot:
-        tensor_ids = self._instances.ids()
-        ids = tensor_ids.cpu().numpy()
-        held = voxels.top_instance >= 0
-        place = np.searchsorted(ids, voxels.top_instance[held])
-        centers, counts = voxels.centers_m[held].astype(np.float64), voxels.top_count[held].astype(np.float64)
-        n = len(ids)
-        totals = np.bincount(place, counts, minlength=n)
-        with np.errstate(invalid="ignore"):
-            centroids = (
-                np.stack([np.bincount(place, counts * centers[:, axis], minlength=n) for axis in range(3)], axis=1)
-                / totals[:, None]
-            )
-        low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
-        np.minimum.at(low, place, centers)
-        np.maximum.at(high, place, centers)
-        low[totals == 0] = high[totals == 0] = np.nan
-        half = 0.5 * self.config.voxel_size_m
-        return InstanceSnapshot(
-            ids,
-            self._instances.weights(tensor_ids).cpu().numpy(),
-            self._instances.voxels(tensor_ids).cpu().numpy(),
-            np.bincount(place, minlength=n),
-            centroids.astype(np.float32),
-            (low - half).astype(np.float32),
-            (high + half).astype(np.float32),
-        )
-
-    def _coordinates(self, points_m: NDArray[np.floating]) -> Tensor:
-        points = self._array("points_m", points_m, (len(points_m), 3), torch.float64)
-        coordinates = torch.floor(points / self.config.voxel_size_m)
-        if coordinates.numel() and float(coordinates.abs().max()) > MAX_COORDINATE:
-            limit_km = MAX_COORDINATE * self.config.voxel_size_m / 1000
-            raise MapError(f"points_m: {float(points.abs().max()):.0f} m is beyond the map's range of {limit_km:.1f} km")
-        return coordinates.to(torch.int64)
-
-    def _array(
-        self, name: str, values: NDArray[np.floating], shape: tuple[int, ...], dtype: torch.dtype = torch.float32
-    ) -> Tensor:
-        if values.shape != shape or not np.issubdtype(values.dtype, np.floating):
-            raise MapError(f"{name}: must be {shape} floating point, got {values.shape} {values.dtype}")
-        tensor = torch.from_numpy(np.ascontiguousarray(values)).to(self._device, dtype)
-        if not bool(torch.isfinite(tensor).all()):  # After the cast, which turns what is too large into infinity.
-            raise MapError(f"{name}: has values that are not finite in {str(dtype).removeprefix('torch.')}")
-        return tensor
-
-    def _index(self, name: str, values: NDArray[np.integer], length: int, bound: int) -> Tensor:
-        if values.shape != (length,) or not np.issubdtype(values.dtype, np.integer):
-            raise MapError(f"{name}: must be ({length},) integer, got {values.shape} {values.dtype}")
-        if length and not (values.min() >= 0 and values.max() < bound):
-            raise MapError(f"{name}: must lie in [0, {bound}), got {values.min()} .. {values.max()}")
-        return torch.from_numpy(values.astype(np.int64)).to(self._device)
-
-    def _unit_rows(self, embeddings: NDArray[np.floating]) -> Tensor:
-        values = self._array("embeddings", embeddings, (len(embeddings), self.dimension), torch.float64)
-        largest = values.abs().amax(dim=1, keepdim=True) if len(values) else values[:, :1]
-        if bool((largest == 0).any()):
-            raise MapError("embeddings: a row has length 0")
-        # Scaled first, so that squares neither overflow nor vanish whatever the row's length.
-        return normalize(values / largest, dim=1).to(torch.float32)
-
-
-def _check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: int) -> None:
-    """Raise MapError unless the arrays of an exported state are all there and fit together."""
-    n, m, i = (len(state.get(name, ())) for name in ("voxel_coordinates", "dense_slot", "instance_id"))
-    shapes = {
-        "voxel_coordinates": (n, 3),
-        "voxel_colors": (n, 3),
-        "dense_slot": (m,),
-        "dense_weight": (m,),
-        "dense_embedding": (m, dimension),
-        "hypothesis_id": (n, max_hypotheses),
-        "hypothesis_count": (n, max_hypotheses),
-        "instance_id": (i,),
-        "instance_weight": (i,),
-        "instance_embedding": (i, dimension),
-        "fused_embedding": (i, dimension),
-        "fused_evidence": (i,),
-        "next_instance_id": (),
-    }
-    for name, shape in shapes.items():
-        if name not in state:
-            raise MapError(f"array '{name}' is missing")
-        if state[name].shape != shape:
-            raise MapError(f"array '{name}' must have the shape {shape}, has {state[name].shape}")
-    for name, array in state.items():
-        if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
-            raise MapError(f"array '{name}' has values that are not finite")
-    for name in ("voxel_coordinates", "dense_slot", "hypothesis_id", "hypothesis_count", "instance_id", "next_instance_id"):
-        if not np.issubdtype(state[name].dtype, np.integer):
-            raise MapError(f"array '{name}' must be of an integer type, is {state[name].dtype}")
-    next_id = int(state["next_instance_id"])
-    for name, bound in (("dense_slot", n), ("instance_id", next_id)):
-        values = state[name]
-        if len(values) and not (values.min() >= 0 and values.max() < bound and len(np.unique(values)) == len(values)):
-            raise MapError(f"array '{name}' must hold distinct values in [0, {bound})")
-    coordinates = state["voxel_coordinates"]
-    if n and np.abs(coordinates.astype(np.int64)).max() > MAX_COORDINATE:
-        raise MapError(f"array 'voxel_coordinates' goes beyond the map's range of +-{MAX_COORDINATE}")
-    if len(np.unique(coordinates, axis=0)) != n:
-        raise MapError("array 'voxel_coordinates' holds a voxel twice")
-    held, counts = state["hypothesis_id"], state["hypothesis_count"]
-    if not np.isin(held[held >= 0], state["instance_id"]).all():
-        raise MapError("array 'hypothesis_id' names an instance that array 'instance_id' lacks")
-    if (counts < 0).any() or ((counts > 0) != (held >= 0)).any():
-        raise MapError("array 'hypothesis_count' must be positive where there is a hypothesis and 0 elsewhere")
-    for name in ("dense_weight", "instance_weight", "fused_evidence"):
-        if (state[name] < 0).any() or (name != "fused_evidence" and (state[name] == 0).any()):
-            raise MapError(f"array '{name}' must be positive")
+        ids = self._instances.ids()
+        weights, hypotheses = self._instances.weights(ids), self._instances.voxels(ids)
+        arrays = (ids.cpu().numpy(), weights.cpu().numpy(), hypotheses.cpu().numpy())
+        return snapshot_instances(*arrays, voxels, self.config.voxel_size_m)

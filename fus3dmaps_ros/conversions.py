@@ -20,7 +20,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from fus3dmaps_core.colors import similarity_colors
 from fus3dmaps_core.query import QueryAnswer, RankedInstance
-from fus3dmaps_core.semantic_map import InstanceSnapshot, VoxelSnapshot
+from fus3dmaps_core.snapshots import InstanceSnapshot, VoxelSnapshot
 from fus3dmaps_msgs.msg import SemanticInstance
 
 _FIELD_TYPES: dict[np.dtype[Any], int] = {

@@ -11,7 +11,7 @@ import numpy as np
 
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_core.segmenters.protocols import Masks
+from fus3dmaps_core.masks import Masks
 
 COLORS = {
     "red": (220, 30, 30),

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.segmenters.protocols import Masks
+from fus3dmaps_core.masks import Masks
 
 
 @dataclass(frozen=True)

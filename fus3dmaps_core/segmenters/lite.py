@@ -14,8 +14,8 @@ from skimage.segmentation import felzenszwalb
 
 from fus3dmaps_core.encoders.lite.detector import Detections, Detector, shared_detector
 from fus3dmaps_core.encoders.lite.evidence import box_iou
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.coplanar import join_coplanar
-from fus3dmaps_core.segmenters.protocols import Masks
 
 _WORKING_PIXELS = 320 * 240
 _SCALE, _SIGMA, _MIN_SEGMENT_PX = 150, 0.8, 80

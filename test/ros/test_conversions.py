@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import Marker
 
 from fus3dmaps_core.query import QueryAnswer, RankedInstance
-from fus3dmaps_core.semantic_map import InstanceSnapshot, VoxelSnapshot
+from fus3dmaps_core.snapshots import InstanceSnapshot, VoxelSnapshot
 from fus3dmaps_ros import conversions
 
 HEADER = conversions.to_header(1_700_000_000_123_456_789, "map")

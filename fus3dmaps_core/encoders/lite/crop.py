@@ -11,7 +11,7 @@ from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import crop_evidence
 from fus3dmaps_core.encoders.lite.network import CLASSES, MEAN, EfficientNetLite0
 from fus3dmaps_core.encoders.lite.space import ConceptSpace
-from fus3dmaps_core.segmenters.protocols import Masks
+from fus3dmaps_core.masks import Masks
 
 # The network was trained at 224 pixels; most crops are smaller than this, and finds are as good in half the time.
 _SIZE_PX = 160

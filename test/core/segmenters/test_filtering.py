@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fus3dmaps_core.config import SegmenterConfig
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.filtering import border_contact, filter_masks
-from fus3dmaps_core.segmenters.protocols import Masks
 
 
 def rectangles(*bounds: tuple[int, int, int, int], size: tuple[int, int] = (40, 60)) -> Masks:

@@ -7,8 +7,8 @@ import pytest
 import skimage.data
 
 from fus3dmaps_core.encoders.lite.evidence import box_iou
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.lite import LiteSegmenter
-from fus3dmaps_core.segmenters.protocols import Masks
 from fus3dmaps_core.segmenters.registry import load_segmenter
 
 

@@ -12,7 +12,7 @@ import skimage.data
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.segmenters.protocols import Masks
+from fus3dmaps_core.masks import Masks
 
 PHOTOGRAPHS = ("chelsea", "coffee", "rocket", "astronaut")
 
