@@ -169,7 +169,7 @@ def query(
         write_ply(ply, answer.points_m, answer.similarity)
 
 
-@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []})
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def node(context: typer.Context) -> None:
     """Run the mapper node; arguments go to ROS, e.g. --ros-args -p map.voxel_size_m:=0.1 -r rgb/image:=/camera/image."""
     _need_ros()

@@ -19,14 +19,14 @@ from fus3dmaps_core.segmenters.coplanar import join_coplanar
 
 _WORKING_PIXELS = 320 * 240
 _SCALE, _SIGMA, _MIN_SEGMENT_PX = 150, 0.8, 80
-_PLANE_ERROR = 0.01
+_MIN_RADIUS_PX = 3.0  # Thinner segments are rims and shadows along edges.
+_PLANE_ERROR = 0.01  # About twice the noise of a structured-light camera at two metres.
 _MIN_SCORE = 0.2
 _MAX_BOX_IOU = 0.5
-_INSIDE = 0.7
+_INSIDE = 0.7  # Share of a segment that lies in the box it belongs to.
 _MIN_FILL = 0.2
+_DEPTH_STEP = 1.2  # Ratio of mean depths from which a box shows a thing and something else behind it.
 _SAME_IOU = 0.85
-_MIN_RADIUS_PX = 3.0
-_DEPTH_STEP = 1.2
 
 
 def load(device: str) -> LiteSegmenter:
@@ -64,7 +64,7 @@ class LiteSegmenter:
             for union in join_coplanar(labels, depth, _PLANE_ERROR)
             if areas[union].max() < _SAME_IOU * areas[union].sum()
         ]
-        filled = self._filled_boxes(rgb, labels, depth)
+        filled = self._filled_boxes(rgb, labels, areas, depth)
         chosen = np.zeros((len(unions), len(areas)), bool)
         for row, union in enumerate(unions):
             chosen[row, union] = True
@@ -73,12 +73,11 @@ class LiteSegmenter:
         return _enlarged(np.concatenate([filled, chosen[:, labels]]), height, width)
 
     def _filled_boxes(
-        self, rgb: NDArray[np.uint8], labels: NDArray[np.int32], depth_m: NDArray[np.float32]
+        self, rgb: NDArray[np.uint8], labels: NDArray[np.int32], areas: NDArray[np.int_], depth_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """(k, h, w) masks of the detections at the size of ``labels``."""
         detections = self._detector.detect(rgb)
         scale = np.array(labels.shape[::-1] * 2, np.float32) / np.array(rgb.shape[1::-1] * 2, np.float32)
-        areas = np.bincount(labels.ravel())
         masks = [
             _fill(np.round(box * scale).astype(int), labels, depth_m, areas)
             for box in detections.boxes[_strongest(detections)]
@@ -155,4 +154,4 @@ def _enlarged(masks: NDArray[np.bool_], height: int, width: int) -> Masks:
     bounds[:, 2:] += bounds[:, :2]
     # The first pixel that takes its value from column x is ceil(x * width / small_width), and so for rows.
     grown = -(-bounds * (width, height, width, height) // (small_width, small_height, small_width, small_height))
-    return Masks(masks[:, :, columns][:, rows], grown.astype(np.int32))
+    return Masks(masks.take(columns, axis=2).take(rows, axis=1), grown.astype(np.int32))

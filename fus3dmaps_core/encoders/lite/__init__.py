@@ -23,7 +23,9 @@ from fus3dmaps_core.encoders.lite.vocabulary import load_vocabulary
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
-_VARIANCE_RATIO = 1.5
+# Measured on hand-drawn boxes of twelve kinds of objects: patches and crops scatter alike around their kind's mean.
+_VARIANCE_RATIO = 1.0
+# Cosines of right and wrong names differ by 0.1 to 0.5, several times those of CLIP-like spaces, whose factor is 100.
 _LOGIT_SCALE = 20.0
 
 

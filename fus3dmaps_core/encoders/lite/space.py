@@ -23,7 +23,7 @@ from fus3dmaps_core.encoders.lite.vocabulary import Vocabulary, embed_in_forms, 
 
 DIMENSION = WIDTH + 1
 
-_DOUBT = 0.6
+_DOUBT = 0.5
 _TEMPERATURE = 2.0
 _TOP_CLASSES = 50
 
