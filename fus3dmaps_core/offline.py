@@ -28,7 +28,6 @@ class RunSummary:
         stages_s: Wall time by stage, seconds.
         drops: Dropped messages and frames by reason.
         last_drop: Newest message of each reason.
-        stamp_ns: Time of the newest frame.
     """
 
     frames: int = 0
@@ -39,7 +38,6 @@ class RunSummary:
     stages_s: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     drops: Counter[str] = field(default_factory=Counter)
     last_drop: dict[str, str] = field(default_factory=dict)
-    stamp_ns: int = 0
 
     @property
     def keyframes_per_s(self) -> float:
@@ -65,7 +63,6 @@ def map_recording(path: Path, pipeline: Pipeline, on_progress: Callable[[int, in
         try:
             for paired in source:
                 summary.frames += 1
-                summary.stamp_ns = paired.stamp_ns
                 if pipeline.wants(paired.T_world_camera):
                     _process(paired, pipeline, summary)
                 if on_progress is not None:
@@ -101,13 +98,13 @@ def _process(paired: PairedMessages, pipeline: Pipeline, summary: RunSummary) ->
         summary.stages_s[stage] += seconds
 
 
-def map_info(pipeline: Pipeline, stamp_ns: int) -> MapInfo:
+def map_info(pipeline: Pipeline) -> MapInfo:
     """What a map file is to say of a pipeline's map."""
     return MapInfo(
         pipeline.trio.name,
         pipeline.trio.logit_scale,
         pipeline.config.input.map_frame,
-        stamp_ns,
+        pipeline.stamp_ns,
         pipeline.config,
         pipeline.camera_poses(),
     )

@@ -52,7 +52,14 @@ class FrameReport:
 
 
 class Pipeline:
-    """Turns posed frames into a map. One thread feeds it; the map may be queried from others meanwhile."""
+    """Turns posed frames into a map. One thread feeds it; the map may be queried from others meanwhile.
+
+    Attributes:
+        config: What it was made with.
+        trio: Encoders.
+        semantic_map: The map.
+        stamp_ns: Time of the newest keyframe, nanoseconds; 0 before the first.
+    """
 
     def __init__(self, config: Config, trio: EncoderTrio, segmenter: Segmenter) -> None:
         """Start with an empty map; ``fusion.variance_ratio`` of 0 takes the trio's own."""
@@ -69,6 +76,7 @@ class Pipeline:
         self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
         self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
         self._processed = 0
+        self.stamp_ns = 0
         self._camera_poses: list[NDArray[np.float64]] = []
 
     @classmethod
@@ -103,6 +111,7 @@ class Pipeline:
             self._integrate_instances(working, T, report)
             self._instance_gate.accept(T)
         self._processed += 1
+        self.stamp_ns = frame.stamp_ns
         self._camera_poses.append(T.copy())
         if self.config.fusion.window_radius_m > 0:
             with report.timed("window"):
@@ -117,7 +126,7 @@ class Pipeline:
         self.semantic_map.reset()
         self._dense_gate.reset()
         self._instance_gate.reset()
-        self._processed = 0
+        self._processed = self.stamp_ns = 0
         self._camera_poses.clear()
 
     def camera_poses(self) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressC
 from rich.table import Table
 
 from fus3dmaps_core.config import Config
-from fus3dmaps_core.errors import ConfigError, Fus3dmapsError
+from fus3dmaps_core.errors import ConfigError, Fus3dmapsError, RecordingError
 
 if TYPE_CHECKING:
     from fus3dmaps_core.query import RankedInstance
@@ -83,9 +83,16 @@ def map_(
     check_map_target(out)
     with _log.status("loading models"):
         pipeline = Pipeline.from_config(config)
-    with _progress("mapping frames") as update:
-        summary = map_recording(bag, pipeline, update)
-    save_map(out, pipeline.semantic_map, map_info(pipeline, summary.stamp_ns))
+    try:
+        with _progress("mapping frames") as update:
+            summary = map_recording(bag, pipeline, update)
+    except RecordingError:
+        if pipeline.semantic_map.voxel_count:
+            pipeline.semantic_map.fuse()
+            save_map(out, pipeline.semantic_map, map_info(pipeline))
+            _log.print(f"what could be read is mapped and saved in '{out}'", markup=False, style="yellow", soft_wrap=True)
+        raise
+    save_map(out, pipeline.semantic_map, map_info(pipeline))
 
     semantic_map = pipeline.semantic_map
     table = Table("stage", "s", "share", title=f"{out}", title_justify="left")

@@ -98,7 +98,9 @@ def _record(room: FurnishedRoom, path: Path, console: Console) -> None:
         for frame in room:
             writer.write(frame)
     console.print(
-        f"recorded a furnished room: {len(room)} frames in {time.perf_counter() - started:.0f} s, {path}", markup=False
+        f"recorded a furnished room: {len(room)} frames in {time.perf_counter() - started:.0f} s, {path}",
+        markup=False,
+        soft_wrap=True,
     )
 
 
@@ -171,9 +173,9 @@ def _follow(
             newer = stamp_ns(reply.similarity)
             best = ranked_instances(reply)
             where = _place(best[0]) if best else "no instance yet"
-            console.print(
-                f"  while mapping: {reply.similarity.width} voxels with an object, '{prompt}' -> {where}", markup=False
-            )
+            if where != last:
+                console.print(f"  while mapping: '{prompt}' {where}", markup=False, soft_wrap=True)
+            last = where
         if newer != newest_ns:
             newest_ns, changed = newer, time.monotonic()
         elif playing.poll() is not None and time.monotonic() - changed > _PATIENCE_S:

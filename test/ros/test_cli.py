@@ -104,6 +104,17 @@ def test_two_runs_give_the_same_files_bit_for_bit(run: Run, recording: Path, map
     assert differing == []
 
 
+def test_of_a_truncated_recording_what_can_be_read_is_saved(run: Run, recording: Path, tmp_path: Path):
+    truncated = tmp_path / "truncated.mcap"
+    intact = recording.read_bytes()
+    truncated.write_bytes(intact[: int(0.6 * len(intact))])
+    code, _, err = run("map", truncated, "--out", tmp_path / "part")
+    assert code == 1
+    assert "truncated.mcap" in err
+    assert str(tmp_path / "part") in err.replace("\n", "")
+    assert run("query", tmp_path / "part", "a pet that meows", "--json")[0] == 0
+
+
 def test_simulate_writes_the_rooms_frames(run: Run, room: FurnishedRoom, tmp_path: Path):
     out = tmp_path / "room.mcap"
     assert run("simulate", out, "--frames", 2)[0] == 0
