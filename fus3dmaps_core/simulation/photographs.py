@@ -1,8 +1,8 @@
 """Real photographs that lie inside the scikit-image wheel; none of them is downloaded.
 
-As scikit-image states: the cat, the espresso, the rocket, the motorcycle and the man with the camera are CC0 (Stéfan van
-der Walt, Rachel Michetti, SpaceX, Daniel Scharstein et al., Lav Varshney); the astronaut is a NASA photograph in the public
-domain.
+As scikit-image states: the cat, the espresso and the man with the camera are CC0 (Stéfan van der Walt, Rachel Michetti, Lav
+Varshney), the rocket (SpaceX) and the astronaut (NASA) in the public domain. The motorcycle is from the Middlebury 2014
+stereo benchmark (Scharstein et al.), for which it names no licence.
 """
 
 from __future__ import annotations
