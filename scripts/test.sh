@@ -7,11 +7,7 @@ set -euo pipefail
 ROOT=$(cd -- "$(dirname -- "${BASH_SOURCE[0]}")/.." && pwd -P)
 bash "$ROOT/scripts/setup.sh"
 
-# A ROS set-up in the calling shell must not reach into the environment, nor its nodes into the tests.
-unset PYTHONPATH PYTHONHOME AMENT_PREFIX_PATH CMAKE_PREFIX_PATH RMW_IMPLEMENTATION ROS_DISCOVERY_SERVER ROS_LOCALHOST_ONLY
-if [[ -n ${_ROS_WHEELS_BOOTSTRAP_COMPLETE:-} ]]; then
-    unset _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
-fi
+source "$ROOT/scripts/isolate.sh"
 # Domains above 101 collide with the ports that Linux hands out; 0 is where everybody else is.
 export ROS_DOMAIN_ID=${FUS3DMAPS_TEST_DOMAIN_ID:-$((1 + RANDOM % 101))}
 export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
