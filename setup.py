@@ -49,7 +49,9 @@ setup(
     # Lower bounds are Ubuntu 24.04's where apt brings the package on a robot; constraints.txt has the tested releases.
     install_requires=[
         "annotated-types>=0.6",
+        "llvmlite>=0.41",
         "mcap>=1.1",
+        "numba>=0.58",
         "numpy>=1.26",
         "opencv-python-headless>=4.6",
         open3d_requirement(),

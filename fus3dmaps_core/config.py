@@ -76,8 +76,11 @@ class MapConfig(_Section):
     iou_threshold: float = Field(
         0.2, ge=0.0, lt=1.0, description="Voxel IoU above which a proposal joins an existing instance."
     )
-    dtype: Literal["float32", "float16"] = Field("float32", description="Storage type of dense embeddings.")
+    dtype: Literal["float32", "float16", "int8"] = Field("float16", description="Storage type of dense embeddings.")
     device: str = Field("cpu", description="Torch device that holds the map, e.g. cpu or cuda:0.")
+    backend: Literal["auto", "compiled", "torch"] = Field(
+        "auto", description="Inner loops: compiled (CPU only), torch (any device), or auto: compiled where they run."
+    )
 
 
 class FusionConfig(_Section):

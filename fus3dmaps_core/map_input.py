@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import normalize
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxels.hash import MAX_COORDINATE
+from fus3dmaps_core.kernels.keys import MAX_COORDINATE
+from fus3dmaps_core.kernels.protocols import MAX_COUNT, Kernels
+from fus3dmaps_core.layers.instances import MAX_ID
 
 _MAX_WEIGHT = 1e6  # Far from where sums in float32 would overflow.
 
@@ -49,24 +51,29 @@ def weight_tensor(weights: NDArray[np.floating], length: int, device: torch.devi
     return tensor
 
 
-def unit_rows(embeddings: NDArray[np.floating], dimension: int, device: torch.device) -> Tensor:
+def unit_rows(embeddings: NDArray[np.floating], dimension: int, kernels: Kernels, device: torch.device) -> Tensor:
     """Embeddings (n, d) of any length but 0, scaled to unit length: float32."""
-    values = float_tensor("embeddings", embeddings, (len(embeddings), dimension), device, torch.float64)
-    largest = values.abs().amax(dim=1, keepdim=True) if len(values) else values[:, :1]
-    if bool((largest == 0).any()):
-        raise MapError("embeddings: a row has length 0")
-    # Scaled first, so that squares neither overflow nor vanish whatever the row's length.
-    return normalize(values / largest, dim=1).to(torch.float32)
+    shape = (*embeddings.shape[:1], dimension)
+    if embeddings.shape != shape or not np.issubdtype(embeddings.dtype, np.floating):
+        raise MapError(f"embeddings: must be {shape} floating point, got {embeddings.shape} {embeddings.dtype}")
+    units, failure = kernels.unit_rows(_tensor(embeddings, device))
+    if failure:
+        raise MapError("embeddings: a row has length 0" if failure == 2 else "embeddings: has values that are not finite")
+    return units
 
 
-def voxel_coordinates(points_m: NDArray[np.floating], voxel_size_m: float, device: torch.device) -> Tensor:
-    """Voxel of each point (n, 3): floor(p / size) per axis, int64."""
-    points = float_tensor("points_m", points_m, (len(points_m), 3), device, torch.float64)
-    coordinates = torch.floor(points / voxel_size_m)
-    if coordinates.numel() and float(coordinates.abs().max()) > MAX_COORDINATE:
-        limit_km = MAX_COORDINATE * voxel_size_m / 1000
-        raise MapError(f"points_m: {float(points.abs().max()):.0f} m is beyond the map's range of {limit_km:.1f} km")
-    return coordinates.to(torch.int64)
+def voxel_keys(points_m: NDArray[np.floating], voxel_size_m: float, kernels: Kernels, device: torch.device) -> Tensor:
+    """Packed key of the voxel of each point (n, 3): floor(p / size) per axis, (n,) int64."""
+    shape = (*points_m.shape[:1], 3)
+    if points_m.shape != shape or not np.issubdtype(points_m.dtype, np.floating):
+        raise MapError(f"points_m: must be {shape} floating point, got {points_m.shape} {points_m.dtype}")
+    keys, largest = kernels.voxel_keys(_tensor(points_m, device), voxel_size_m)
+    if not math.isfinite(largest):
+        raise MapError("points_m: has values that are not finite")
+    if largest > MAX_COORDINATE:
+        farthest, limit_km = largest * voxel_size_m, MAX_COORDINATE * voxel_size_m / 1000
+        raise MapError(f"points_m: {farthest:.0f} m is beyond the map's range of {limit_km:.1f} km")
+    return keys
 
 
 def check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: int) -> None:
@@ -87,11 +94,15 @@ def check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: 
         "fused_evidence": (i,),
         "next_instance_id": (),
     }
+    if "dense_embedding" in state and state["dense_embedding"].dtype == np.int8:
+        shapes["dense_scale"] = (m,)
     for name, shape in shapes.items():
         if name not in state:
             raise MapError(f"array '{name}' is missing")
         if state[name].shape != shape:
             raise MapError(f"array '{name}' must have the shape {shape}, has {state[name].shape}")
+        if not np.issubdtype(state[name].dtype, np.number):
+            raise MapError(f"array '{name}' must hold numbers, is {state[name].dtype}")
     for name, array in state.items():
         if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
             raise MapError(f"array '{name}' has values that are not finite")
@@ -99,6 +110,8 @@ def check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: 
         if not np.issubdtype(state[name].dtype, np.integer):
             raise MapError(f"array '{name}' must be of an integer type, is {state[name].dtype}")
     next_id = int(state["next_instance_id"])
+    if not 0 <= next_id <= MAX_ID:
+        raise MapError(f"array 'next_instance_id' must lie in [0, {MAX_ID}], is {next_id}")
     for name, bound in (("dense_slot", n), ("instance_id", next_id)):
         values = state[name]
         if len(values) and not (values.min() >= 0 and values.max() < bound and len(np.unique(values)) == len(values)):
@@ -109,10 +122,23 @@ def check_state(state: dict[str, NDArray[Any]], dimension: int, max_hypotheses: 
     if len(np.unique(coordinates, axis=0)) != n:
         raise MapError("array 'voxel_coordinates' holds a voxel twice")
     held, counts = state["hypothesis_id"], state["hypothesis_count"]
-    if not np.isin(held[held >= 0], state["instance_id"]).all():
-        raise MapError("array 'hypothesis_id' names an instance that array 'instance_id' lacks")
-    if (counts < 0).any() or ((counts > 0) != (held >= 0)).any():
-        raise MapError("array 'hypothesis_count' must be positive where there is a hypothesis and 0 elsewhere")
+    if not np.array_equal(np.unique(held[held >= 0]), np.sort(state["instance_id"])):
+        raise MapError("arrays 'hypothesis_id' and 'instance_id' must name the same instances")
+    ordered = np.sort(held, axis=1)
+    if ((ordered[:, 1:] >= 0) & (ordered[:, 1:] == ordered[:, :-1])).any():
+        raise MapError("array 'hypothesis_id' names an instance twice in one voxel")
+    if (counts < 0).any() or (counts > MAX_COUNT).any() or ((counts > 0) != (held >= 0)).any():
+        raise MapError(
+            f"array 'hypothesis_count' must lie in [1, {MAX_COUNT}] where there is a hypothesis and be 0 elsewhere"
+        )
+    if "dense_scale" in shapes and (state["dense_scale"] <= 0).any():
+        raise MapError("array 'dense_scale' must be positive")
     for name in ("dense_weight", "instance_weight", "fused_evidence"):
         if (state[name] < 0).any() or (name != "fused_evidence" and (state[name] == 0).any()):
             raise MapError(f"array '{name}' must be positive")
+
+
+def _tensor(values: NDArray[np.floating], device: torch.device) -> Tensor:
+    """The values in a type that torch and kernels know."""
+    wide = values if values.dtype in (np.float32, np.float64) else values.astype(np.float64)
+    return torch.from_numpy(np.ascontiguousarray(wide)).to(device)

@@ -21,6 +21,7 @@ from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
 from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.warm_up import warm_up
 
 
 @dataclass
@@ -81,13 +82,15 @@ class Pipeline:
 
     @classmethod
     def from_config(cls, config: Config) -> Pipeline:
-        """Load the encoders and the segmenter that the configuration names.
+        """Load the encoders and the segmenter that the configuration names, and warm up the map.
 
         Raises:
             EncoderError: One of them is unknown, or its packages or weights are missing or altered.
         """
         segmenter = load_segmenter(config.segmenter.name, config.encoder.device)
-        return cls(config, load_trio(config.encoder.name, config.encoder.device, config.segmenter.crop_padding), segmenter)
+        trio = load_trio(config.encoder.name, config.encoder.device, config.segmenter.crop_padding)
+        warm_up(trio.dimension, config.map)
+        return cls(config, trio, segmenter)
 
     def wants(self, T_world_camera: NDArray[np.float64]) -> bool:
         """Whether a frame with this pose would be a keyframe of either layer; changes nothing."""

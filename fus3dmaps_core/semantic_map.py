@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -17,26 +19,19 @@ from torch import Tensor
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.layers.dense import DenseLayer
-from fus3dmaps_core.layers.fusion import fuse_instances
-from fus3dmaps_core.layers.instances import InstanceLayer
-from fus3dmaps_core.layers.similarity import dense_similarity, fused_dense_similarity, instance_similarity
-from fus3dmaps_core.map_input import (
-    check_state,
-    float_tensor,
-    index_tensor,
-    unit_rows,
-    voxel_coordinates,
-    weight_tensor,
-)
-from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, LayerSimilarity, VoxelSnapshot, snapshot_instances
-from fus3dmaps_core.voxels.columns import Column
-from fus3dmaps_core.voxels.hash import VoxelHash, pack
+from fus3dmaps_core.kernels.protocols import Extents, Pairs, SlotBlock
+from fus3dmaps_core.kernels.selection import select_kernels
+from fus3dmaps_core.layers.fusion import FusionInputs
+from fus3dmaps_core.layers.similarity import DenseCosines, FusedDenseCosines, InstanceCosines, LayerCosines
+from fus3dmaps_core.map_input import check_state, float_tensor, index_tensor, unit_rows, voxel_keys, weight_tensor
+from fus3dmaps_core.map_state import MapState
+from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, SimilarityBlock, VoxelSnapshot, snapshot_instances
 
 LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
 """Names of the layers that can be queried."""
 
-_UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
+_BLOCK_SLOTS = 16384  # Voxels that a query looks at together: a few megabytes of cosines and positions.
+_BLOCK_COSINES = 2**21
 
 
 class SemanticMap:
@@ -47,58 +42,50 @@ class SemanticMap:
 
         Args:
             dimension: Embedding width d.
-            config: Voxel size, hypotheses, association threshold, storage type and device.
+            config: Voxel size, hypotheses, association threshold, storage type, device and kernels.
             variance_ratio: lambda = R^D / R^I.
             window_radius_m: Radius r_w of the sliding window, metres; 0 keeps the whole dense layer and makes fusion
                 replace every fused embedding, where a window keeps those of more evidence.
+
+        Raises:
+            ConfigError: The kernels that the configuration names do not run here.
         """
         self.dimension = dimension
         self.config = config
         self.variance_ratio = variance_ratio
         self.window_radius_m = window_radius_m
         self._device = torch.device(config.device)
+        self._kernels = select_kernels(config.backend, self._device)
         self._lock = threading.RLock()
-        self._clear()
-
-    def _clear(self) -> None:
-        self._hash = VoxelHash(self._device)
-        self._colors = Column(torch.uint8, _UNSEEN_COLOR, self._device, width=3)
-        self._dense = DenseLayer(self.dimension, getattr(torch, self.config.dtype), self._device)
-        self._instances = InstanceLayer(self.dimension, self.config.max_hypotheses, self.config.iou_threshold, self._device)
-        self._fresh_fusion: tuple[Tensor, Tensor, Tensor] | None = None
+        self._state = self._empty_state()
 
     @property
     def voxel_count(self) -> int:
         """Voxels of the map."""
         with self._lock:
-            return len(self._hash)
+            return len(self._state.hash)
 
     @property
     def dense_voxel_count(self) -> int:
         """Voxels with a dense embedding."""
         with self._lock:
-            return len(self._dense)
+            return len(self._state.dense)
 
     @property
     def instance_count(self) -> int:
         """Instances alive."""
         with self._lock:
-            return len(self._instances)
+            return len(self._state.instances)
 
     def nbytes(self) -> dict[str, int]:
         """Allocated bytes by part."""
         with self._lock:
-            return {
-                "hash": self._hash.nbytes,
-                "colors": self._colors.nbytes,
-                "dense": self._dense.nbytes,
-                "instances": self._instances.nbytes,
-            }
+            return self._state.nbytes()
 
     def reset(self) -> None:
         """Empty the map; instance ids start at 0 again."""
         with self._lock:
-            self._clear()
+            self._state = self._empty_state()
 
     def integrate_dense(
         self,
@@ -120,22 +107,26 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        coordinates = voxel_coordinates(points_m, self.config.voxel_size_m, self._device)
+        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
+        unit = unit_rows(embeddings, self.dimension, self._kernels, self._device)
         patch_index = index_tensor("patches", patches, len(points_m), len(embeddings), self._device)
-        unit = unit_rows(embeddings, self.dimension, self._device)
         patch_weights = weight_tensor(weights, len(embeddings), self._device)
         if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
             raise MapError(f"colors: must be ({len(points_m)}, 3) uint8, got {colors.shape} {colors.dtype}")
-        if not len(coordinates):
+        if not len(keys):
             return
-        keys, voxels, counts = torch.unique(pack(coordinates), return_inverse=True, return_counts=True)
+        keys, voxels, counts = self._kernels.distinct(keys)
         color_sums = torch.zeros((len(keys), 3), dtype=torch.int64, device=self._device)
         color_sums.index_add_(0, voxels, torch.from_numpy(colors.astype(np.int64)).to(self._device))
+        mean_colors = ((2 * color_sums + counts[:, None]) // (2 * counts[:, None])).to(torch.uint8)
+        if not bool((patch_weights > 0).all()):
+            useful = patch_weights[patch_index] > 0
+            voxels, patch_index = voxels[useful], patch_index[useful]
+        observations = self._kernels.count_pairs(voxels, patch_index, len(keys), len(unit))
         with self._lock:
-            slots = self._slots(keys)
-            self._colors[slots] = ((2 * color_sums + counts[:, None]) // (2 * counts[:, None])).to(torch.uint8)
-            self._dense.accumulate(slots, voxels, patch_index, unit, patch_weights)
-            self._fresh_fusion = None
+            slots = self._state.slots(keys)
+            self._state.colors[slots] = mean_colors
+            self._state.instances.touch(self._state.dense.accumulate(slots, keys, observations, unit, patch_weights))
 
     def integrate_proposals(
         self, points_m: NDArray[np.floating], proposals: NDArray[np.integer], embeddings: NDArray[np.floating]
@@ -154,23 +145,20 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        coordinates = voxel_coordinates(points_m, self.config.voxel_size_m, self._device)
+        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
+        unit = unit_rows(embeddings, self.dimension, self._kernels, self._device)
         proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
-        unit = unit_rows(embeddings, self.dimension, self._device)
-        ids = np.full(len(embeddings), -1, np.int64)
-        if not len(coordinates):
-            return ids
-        keys, voxels = torch.unique(pack(coordinates), return_inverse=True)
-        pairs, counts = torch.unique(proposal_index * len(keys) + voxels, return_counts=True)
-        present, sizes = torch.unique_consecutive(pairs // len(keys), return_counts=True)
+        if not len(keys):
+            return np.full(len(embeddings), -1, np.int64)
+        keys, voxels, _ = self._kernels.distinct(keys)
+        pairs = self._kernels.count_pairs(proposal_index, voxels, len(unit), len(keys))
         with self._lock:
-            slots = self._slots(keys)[pairs % len(keys)]
-            end = 0
-            for proposal, size in zip(present.tolist(), sizes.tolist(), strict=True):
-                start, end = end, end + size
-                ids[proposal] = self._instances.integrate(slots[start:end], counts[start:end], unit[proposal])
-            self._fresh_fusion = None
-        return ids
+            self._state.instances.check_room(len(unit))
+            slots = self._state.slots(keys)
+            groups = Pairs(pairs.offsets, slots.index_select(0, pairs.partners), pairs.counts)
+            ids, created = self._state.instances.integrate(groups, unit)
+            self._state.fused.admit(created)
+        return ids.cpu().numpy()
 
     def prune_window(self, center_m: NDArray[np.floating]) -> int:
         """Drop the dense embeddings of voxels whose centre is farther than the window's radius [sec: Sliding Window].
@@ -188,55 +176,87 @@ class SemanticMap:
         if self.window_radius_m <= 0:
             return 0
         with self._lock:
-            rows, slots = self._dense.live()
-            distance = torch.linalg.vector_norm(self._centers(slots) - center, dim=1)
-            gone = rows[distance > self.window_radius_m]
+            rows, slots = self._state.dense.live()
+            keys = self._state.hash.keys(slots)
+            gone = self._kernels.farther(keys, self.config.voxel_size_m, center, self.window_radius_m)
             if len(gone):
-                self._dense.drop(gone)
-                self._fresh_fusion = None
+                self._state.instances.touch(slots.index_select(0, gone))
+                self._state.dense.drop(rows.index_select(0, gone))
             return len(gone)
 
-    def fuse(self) -> FusionReport:
+    def remove_voxels(self, points_m: NDArray[np.floating]) -> int:
+        """Remove the voxels that contain the points, with all that both layers know of them.
+
+        Instances that are left without a voxel are deleted; others keep their embedding. What is stored of a removed voxel
+        is given to new ones.
+
+        Args:
+            points_m: (n, 3) in the map frame, metres; points outside of all voxels are no fault.
+
+        Returns:
+            Number of voxels removed.
+
+        Raises:
+            MapError: A shape, dtype, range or value is wrong.
+        """
+        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
+        keys, _, _ = self._kernels.distinct(keys)
+        with self._lock:
+            slots = self._state.hash.find(keys)
+            slots = slots[slots >= 0]
+            if len(slots):
+                self._state.remove(slots)
+            return len(slots)
+
+    def fuse(self, full: bool = False) -> FusionReport:
         """Fuse the layers and store the instances' fused embeddings [sec: 3D Cross-Layer Semantic Fusion].
 
-        Without a window every fused embedding is replaced. With one, only those whose new evidence is greater than the
-        stored evidence, so that an object keeps what it had gathered when its dense voxels have left the window.
+        Without a window every fused embedding becomes that of the map as it is. With one, only those are replaced whose new
+        evidence is greater than the stored evidence, so that an object keeps what it had gathered when its dense voxels
+        have left the window.
+
+        Args:
+            full: Compute every instance. Otherwise only those that have changed since are computed, with the same result.
         """
         started = time.perf_counter()
         with self._lock:
-            ids, fused, evidence = self._fusion()
-            if self.window_radius_m > 0:
-                better = evidence > self._instances.evidence(ids)
-                ids, fused, evidence = ids[better], fused[better], evidence[better]
-            self._instances.store_fused(ids, fused, evidence)
-            return FusionReport(len(self._instances), len(ids), len(self._hash), time.perf_counter() - started)
+            state = self._state
+            updated, recomputed = state.fused.fuse(self._fusion_inputs(), full)
+            duration_s = time.perf_counter() - started
+            return FusionReport(len(state.instances), updated, recomputed, len(state.hash), duration_s)
 
     def voxels(self) -> VoxelSnapshot:
         """A copy of all voxels."""
         with self._lock:
-            count = len(self._hash)
-            slots = slice(0, count)
-            self._reserve()
-            top, top_count = self._instances.top(slots)
+            state = self._state
+            slots = state.hash.live()
+            top_rows, top_counts = state.instances.top(slots)
             return VoxelSnapshot(
-                self._centers(slots).to(torch.float32).cpu().numpy(),
-                self._colors[slots].cpu().numpy().copy(),
-                top.cpu().numpy(),
-                top_count.cpu().numpy(),
-                self._dense.weights(slots).cpu().numpy(),
+                self._kernels.centers(state.hash.keys(slots), self.config.voxel_size_m).cpu().numpy(),
+                state.colors[slots].cpu().numpy(),
+                state.instances.ids(top_rows).cpu().numpy(),
+                top_counts.cpu().numpy(),
+                state.dense.weights(state.dense.rows(slots)).cpu().numpy(),
             )
 
     def instances(self) -> InstanceSnapshot:
         """A copy of all instances alive."""
-        with self._lock:
-            return self._snapshot_instances(self.voxels())
+        return self._visit(None, None)
 
-    def similarity(self, layer: str, texts: NDArray[np.float32]) -> LayerSimilarity:
-        """Cosines of a layer with texts. Without a window, fusion is computed for the map as it is.
+    def visit_similarity(
+        self, layer: str, texts: NDArray[np.float32], visit: Callable[[SimilarityBlock], None]
+    ) -> InstanceSnapshot:
+        """Hand out the cosines of a layer with texts, block by block, so that memory does not follow the map's size.
+
+        Without a window, fusion is that of the map as it is. The map does not change meanwhile.
 
         Args:
             layer: One of LAYERS.
             texts: (p, d) text embeddings, any length but 0.
+            visit: Called with some thousand voxels at a time, in the order of slots.
+
+        Returns:
+            The instances of the same moment.
 
         Raises:
             QueryError: The layer is unknown.
@@ -244,58 +264,18 @@ class SemanticMap:
         """
         if layer not in LAYERS:
             raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
-        unit = unit_rows(texts, self.dimension, self._device)
+        unit = unit_rows(texts, self.dimension, self._kernels, self._device)
         with self._lock:
-            self._reserve()
-            count = len(self._hash)
-            if layer == "dense":
-                slots, cosines = dense_similarity(self._dense, unit)
-            elif layer == "fused_dense":
-                slots, cosines = fused_dense_similarity(self._dense, self._instances, count, self.variance_ratio, unit)
-            else:
-                ids = self._instances.ids()
-                if layer == "instances":
-                    embeddings = self._instances.embeddings(ids)
-                elif self.window_radius_m > 0:
-                    embeddings = self._instances.fused_embeddings(ids)
-                else:
-                    embeddings = self._fusion()[1]
-                slots, cosines = instance_similarity(self._instances, embeddings, count, unit)
-            voxels = self.voxels()
-            return LayerSimilarity(slots.cpu().numpy(), cosines.cpu().numpy(), voxels, self._snapshot_instances(voxels))
+            return self._visit(self._cosines(layer, unit), visit, max(256, _BLOCK_COSINES // max(1, len(unit))))
 
     def export_state(self) -> dict[str, NDArray[Any]]:
-        """Everything the map holds, as arrays by name; what a map file stores and what :meth:`from_state` reads.
+        """Everything the map holds, as arrays by name: what a map file stores and what :meth:`import_state` reads.
 
         Returns:
-            voxel_coordinates (n, 3) int32; voxel_colors (n, 3) uint8; dense_slot (m,) int32; dense_weight (m,) float32;
-            dense_embedding (m, d) in the storage type; hypothesis_id, hypothesis_count (n, K) int32; instance_id (i,) int64;
-            instance_weight (i,) float64; instance_embedding (i, d) float32; fused_embedding (i, d) float32;
-            fused_evidence (i,) float64, 0 before the first fusion; next_instance_id () int64.
+            What :meth:`MapState.export` says.
         """
         with self._lock:
-            self._reserve()
-            slots = slice(0, len(self._hash))
-            rows, dense_slots = self._dense.live()
-            dense_slots, order = torch.sort(dense_slots)
-            ids = self._instances.ids()
-            held, counts = self._instances.hypotheses(slots)
-            state = {
-                "voxel_coordinates": self._hash.coordinates().to(torch.int32),
-                "voxel_colors": self._colors[slots].clone(),
-                "dense_slot": dense_slots.to(torch.int32),
-                "dense_weight": self._dense.weights(dense_slots),
-                "dense_embedding": self._dense.pool.read(rows[order]).to(getattr(torch, self.config.dtype)),
-                "hypothesis_id": held.to(torch.int32),
-                "hypothesis_count": counts.to(torch.int32),
-                "instance_id": ids,
-                "instance_weight": self._instances.weights(ids),
-                "instance_embedding": self._instances.embeddings(ids),
-                "fused_embedding": self._instances.fused_embeddings(ids),
-                "fused_evidence": self._instances.evidence(ids),
-                "next_instance_id": torch.tensor(self._instances.next_id),
-            }
-            return {name: tensor.cpu().numpy() for name, tensor in state.items()}
+            return self._state.export()
 
     def import_state(self, state: dict[str, NDArray[Any]]) -> None:
         """Replace the map's content by an exported state.
@@ -304,48 +284,55 @@ class SemanticMap:
             MapError: An array is missing or its shape does not fit this map; the map keeps what it had.
         """
         check_state(state, self.dimension, self.config.max_hypotheses)
-        tensors = {name: torch.from_numpy(np.array(array)).to(self._device) for name, array in state.items()}
+        fresh = self._empty_state()
+        fresh.fill(state)
         with self._lock:
-            self._clear()
-            slots = self._slots(pack(tensors["voxel_coordinates"].to(torch.int64)))
-            self._colors[slots] = tensors["voxel_colors"]
-            self._dense.restore(
-                tensors["dense_slot"].to(torch.int64), tensors["dense_weight"], tensors["dense_embedding"].to(torch.float32)
-            )
-            self._instances.restore(slots, tensors["hypothesis_id"], tensors["hypothesis_count"])
-            self._instances.restore_instances(
-                int(tensors["next_instance_id"]),
-                tensors["instance_id"],
-                tensors["instance_weight"],
-                tensors["instance_embedding"],
-                tensors["fused_embedding"],
-                tensors["fused_evidence"],
-                len(slots),
-            )
+            self._state = fresh
 
-    def _fusion(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Fusion of the map as it is, kept until the map changes."""
-        if self._fresh_fusion is None:
-            self._fresh_fusion = fuse_instances(self._dense, self._instances, self.variance_ratio)
-        return self._fresh_fusion
+    def _empty_state(self) -> MapState:
+        return MapState(self.dimension, self.config, self.window_radius_m > 0, self._kernels)
 
-    def _slots(self, keys: Tensor) -> Tensor:
-        slots = self._hash.find_or_insert(keys)
-        self._reserve()
-        return slots
+    def _fusion_inputs(self) -> FusionInputs:
+        return FusionInputs(self._kernels, self._state.dense, self._state.instances, self.variance_ratio)
 
-    def _reserve(self) -> None:
-        count = len(self._hash)
-        self._colors.reserve(count)
-        self._dense.reserve(count)
-        self._instances.reserve(count)
+    def _cosines(self, layer: str, unit: Tensor) -> LayerCosines:
+        if layer == "dense":
+            return DenseCosines(self._kernels, self._state.dense, unit)
+        if layer == "fused_dense":
+            return FusedDenseCosines(self._fusion_inputs(), unit)
+        fused = self._state.fused if layer == "fused_instances" else None
+        return InstanceCosines(self._fusion_inputs(), fused, unit, self._state.instances.live()[1])
 
-    def _centers(self, slots: Tensor | slice) -> Tensor:
-        """Voxel centres, (n, 3) float64 metres."""
-        return (self._hash.coordinates(slots).to(torch.float64) + 0.5) * self.config.voxel_size_m
-
-    def _snapshot_instances(self, voxels: VoxelSnapshot) -> InstanceSnapshot:
-        ids = self._instances.ids()
-        weights, hypotheses = self._instances.weights(ids), self._instances.voxels(ids)
-        arrays = (ids.cpu().numpy(), weights.cpu().numpy(), hypotheses.cpu().numpy())
-        return snapshot_instances(*arrays, voxels, self.config.voxel_size_m)
+    def _visit(
+        self,
+        cosines: LayerCosines | None,
+        visit: Callable[[SimilarityBlock], None] | None,
+        block_slots: int = _BLOCK_SLOTS,
+    ) -> InstanceSnapshot:
+        """One pass over all voxels: what instances occupy, and the cosines of a layer."""
+        with self._lock:
+            state = self._state
+            ids, rows = state.instances.live()
+            extents = state.instances.extents()
+            place = torch.full((state.instances.pool.high_water + 1,), -1, dtype=torch.int64, device=self._device)
+            place[rows + 1] = torch.arange(len(rows), device=self._device)  # The first stays -1, for row -1.
+            step = min(block_slots, _BLOCK_SLOTS)
+            with_dense, with_instance = (False, False) if cosines is None else (cosines.with_dense, cosines.with_instance)
+            for first in range(0, state.hash.high_water, step):
+                slots = slice(first, min(first + step, state.hash.high_water))
+                block = SlotBlock(first, state.hash.keys(slots), state.dense.row_of_slot(slots), self.config.voxel_size_m)
+                picked = state.instances.survey(block, extents, with_dense, with_instance)
+                if cosines is not None and visit is not None and len(picked.top_rows):
+                    values, owners = cosines(picked), place.index_select(0, picked.top_rows + 1)
+                    visit(
+                        SimilarityBlock(
+                            centers_m=picked.centers_m.cpu().numpy(),
+                            cosines=values.cpu().numpy(),
+                            instances=owners.cpu().numpy(),
+                            map_voxels=len(state.hash),
+                            map_instances=len(rows),
+                        )
+                    )
+            of_rows = Extents(*(getattr(extents, field.name)[rows] for field in fields(Extents)))
+            weights, hypotheses = state.instances.weights(rows), state.instances.voxels(rows)
+            return snapshot_instances(ids, weights, hypotheses, of_rows, self.config.voxel_size_m)

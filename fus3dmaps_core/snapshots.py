@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from fus3dmaps_core.kernels.protocols import Extents
 
 
 @dataclass(frozen=True)
@@ -14,20 +18,22 @@ class FusionReport:
 
     Attributes:
         instances: Instances alive.
-        updated: Instances whose fused embedding was replaced.
+        updated: Instances whose stored fused embedding is of this fusion.
+        recomputed: Instances that had changed, and were computed.
         voxels: Voxels of the map.
         duration_s: Wall time, seconds.
     """
 
     instances: int
     updated: int
+    recomputed: int
     voxels: int
     duration_s: float
 
 
 @dataclass(frozen=True)
 class VoxelSnapshot:
-    """A copy of the map's voxels, by slot.
+    """A copy of the map's voxels, in the order of their slots.
 
     Attributes:
         centers_m: (n, 3) float32 voxel centres in the map frame, metres.
@@ -68,28 +74,26 @@ class InstanceSnapshot:
 
 
 @dataclass(frozen=True)
-class LayerSimilarity:
-    """Similarities of one layer with some texts, and the map they belong to, all of one moment.
+class SimilarityBlock:
+    """Similarities of some voxels of one layer with some texts.
 
     Attributes:
-        slots: (n,) int64 slots that have the layer, ascending.
+        centers_m: (n, 3) float32 voxel centres in the map frame, metres.
         cosines: (n, p) float32.
-        voxels: The map's voxels.
-        instances: The map's instances.
+        instances: (n,) int64, place in the InstanceSnapshot of the instance that occupies the voxel, -1 without one.
+        map_voxels: Voxels of the map: more than this are not to come.
+        map_instances: Instances of the map.
     """
 
-    slots: NDArray[np.int64]
+    centers_m: NDArray[np.float32]
     cosines: NDArray[np.float32]
-    voxels: VoxelSnapshot
-    instances: InstanceSnapshot
+    instances: NDArray[np.int64]
+    map_voxels: int
+    map_instances: int
 
 
 def snapshot_instances(
-    ids: NDArray[np.int64],
-    weights: NDArray[np.float64],
-    hypothesis_voxels: NDArray[np.int64],
-    voxels: VoxelSnapshot,
-    voxel_size_m: float,
+    ids: Tensor, weights: Tensor, hypothesis_voxels: Tensor, extents: Extents, voxel_size_m: float
 ) -> InstanceSnapshot:
     """Instances with the place that each occupies.
 
@@ -97,27 +101,19 @@ def snapshot_instances(
         ids: (n,) ascending ids of the instances alive.
         weights: (n,) their weights.
         hypothesis_voxels: (n,) their |V_id|.
-        voxels: All voxels of the map.
+        extents: n rows: what they occupy.
         voxel_size_m: Edge of a voxel, metres.
     """
-    held = voxels.top_instance >= 0
-    place = np.searchsorted(ids, voxels.top_instance[held])
-    centers, counts = voxels.centers_m[held].astype(np.float64), voxels.top_count[held].astype(np.float64)
-    n = len(ids)
-    totals = np.bincount(place, counts, minlength=n)
-    sums = np.stack([np.bincount(place, counts * centers[:, axis], minlength=n) for axis in range(3)], axis=1)
-    with np.errstate(invalid="ignore"):
-        centroids = sums / totals[:, None]
-    low, high = np.full((n, 3), np.inf), np.full((n, 3), -np.inf)
-    np.minimum.at(low, place, centers)
-    np.maximum.at(high, place, centers)
-    low[totals == 0] = high[totals == 0] = np.nan
+    nowhere = (extents.voxels == 0)[:, None]
+    centroids = extents.sums.to(torch.float64) / extents.counts.to(torch.float64)[:, None] + 0.5
+    corners = [torch.where(nowhere, torch.nan, each.to(torch.float64)) for each in (extents.low, extents.high + 1)]
+    centroids_m, low_m, high_m = ((each * voxel_size_m).to(torch.float32).cpu().numpy() for each in (centroids, *corners))
     return InstanceSnapshot(
-        ids,
-        weights,
-        hypothesis_voxels,
-        np.bincount(place, minlength=n),
-        centroids.astype(np.float32),
-        (low - 0.5 * voxel_size_m).astype(np.float32),
-        (high + 0.5 * voxel_size_m).astype(np.float32),
+        ids=ids.cpu().numpy(),
+        weights=weights.cpu().numpy(),
+        hypothesis_voxels=hypothesis_voxels.cpu().numpy(),
+        voxel_counts=extents.voxels.cpu().numpy(),
+        centroids_m=centroids_m,
+        boxes_min_m=low_m,
+        boxes_max_m=high_m,
     )

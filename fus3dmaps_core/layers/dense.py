@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn.functional import embedding_bag
 
-from fus3dmaps_core.voxels.columns import Column
-from fus3dmaps_core.voxels.rows import RowPool
+from fus3dmaps_core.kernels.protocols import Kernels, Pairs
+from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.rounding import seeds_of
+from fus3dmaps_core.memory.rows import RowPool
 
 
 class DenseLayer:
     """Weights and mean embeddings in pooled rows; a voxel has a row only while it has dense evidence."""
 
-    def __init__(self, dimension: int, dtype: torch.dtype, device: torch.device) -> None:
+    def __init__(self, dimension: int, dtype: torch.dtype, kernels: Kernels, device: torch.device) -> None:
         """Start empty; means are stored in ``dtype`` and computed in float32."""
+        self._kernels = kernels
         self._device = device
         self.pool = RowPool(dimension, dtype, device)
         self._row_of_slot = Column(torch.int32, -1, device)
@@ -33,60 +35,61 @@ class DenseLayer:
         """Row of each slot, -1 where a voxel has no dense embedding: (n,) int64."""
         return self._row_of_slot[slots].to(torch.int64)
 
-    def weights(self, slots: Tensor | slice) -> Tensor:
-        """Weight w^D of each slot, 0 where a voxel has no dense embedding: (n,) float32."""
-        rows = self.rows(slots)
-        if not len(self._weight_of_row[:]):
+    def row_of_slot(self, slots: slice) -> Tensor:
+        """Row of each slot, -1 where a voxel has no dense embedding: (n,) int32, not a copy."""
+        return self._row_of_slot[slots]
+
+    def slot_of_row(self) -> Tensor:
+        """Slot of every row ever given, -1 for a free one: (rows,) int32, not a copy."""
+        return self._slot_of_row[: self.pool.high_water]
+
+    def weight_of_row(self) -> Tensor:
+        """Weight w^D of every row ever given: (rows,) float32, not a copy."""
+        return self._weight_of_row[: self.pool.high_water]
+
+    def weights(self, rows: Tensor) -> Tensor:
+        """Weight w^D of each row, 0 for row -1: (n,) float32."""
+        if not self.pool.high_water:
             return torch.zeros(len(rows), device=self._device)
         return torch.where(rows >= 0, self._weight_of_row[rows.clamp(min=0)], 0.0)
 
     def live(self) -> tuple[Tensor, Tensor]:
         """Rows in use and their slots, in the order of rows: two (n,) int64."""
-        slots = self._slot_of_row[: self.pool.high_water]
+        slots = self.slot_of_row()
         rows = torch.nonzero(slots >= 0).squeeze(1)
-        return rows, slots[rows].to(torch.int64)
+        return rows, slots.index_select(0, rows).to(torch.int64)
 
-    def live_blocks(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """Per storage block: slots (n,) int64, weights (n,) float32 and means (n, d) float32 of the voxels in it."""
-        parts = []
-        for first, block in self.pool.blocks():
-            slots = self._slot_of_row[first : first + len(block)].to(torch.int64)
-            used = torch.nonzero(slots >= 0).squeeze(1)
-            if len(used):
-                parts.append((slots[used], self._weight_of_row[first + used], block[used].to(torch.float32)))
-        return parts
-
-    def accumulate(self, slots: Tensor, voxels: Tensor, patches: Tensor, embeddings: Tensor, weights: Tensor) -> None:
+    def accumulate(self, slots: Tensor, keys: Tensor, observations: Pairs, embeddings: Tensor, weights: Tensor) -> Tensor:
         """Add the observations of one keyframe [eq. dense_agg].
 
         Observations are counted per (voxel, patch) pair first and then multiplied, so that no point-by-d matrix exists.
 
         Args:
             slots: (v,) int64 distinct slots.
-            voxels: (n,) int64, for each point the index of its voxel in ``slots``.
-            patches: (n,) int64, for each point the index of its patch.
+            keys: (v,) int64 packed keys of these voxels.
+            observations: v groups of patches: how many points of each patch fell into the voxel.
             embeddings: (p, d) float32 unit vectors, one per patch.
-            weights: (p,) float32, the weight a of one observation of a patch; patches of weight 0 add nothing.
-        """
-        useful = weights[patches] > 0
-        pairs, counts = torch.unique(voxels[useful] * len(weights) + patches[useful], return_counts=True)
-        if not len(pairs):
-            return
-        pair_patch = pairs % len(weights)
-        pair_weight = counts.to(torch.float32) * weights[pair_patch]
-        hit, lengths = torch.unique_consecutive(pairs // len(weights), return_counts=True)
-        offsets = torch.cumsum(lengths, 0) - lengths
-        sums = embedding_bag(pair_patch, embeddings, offsets, mode="sum", per_sample_weights=pair_weight)
-        added = torch.segment_reduce(pair_weight, "sum", lengths=lengths)
+            weights: (p,) float32 > 0, the weight a of one observation of a patch.
 
-        rows, fresh = self._rows_for(slots[hit])
-        old_weight = self._weight_of_row[rows]
-        new_weight = old_weight + added
-        means = self.pool.read(rows)
-        means[fresh] = 0.0  # A fresh row holds whatever its last owner left.
-        means.mul_(old_weight[:, None]).add_(sums).div_(new_weight[:, None])
-        self.pool.write(rows, means)
-        self._weight_of_row[rows] = new_weight
+        Returns:
+            Slots that were observed, int64.
+        """
+        lengths = observations.offsets.diff()
+        hit = torch.nonzero(lengths).squeeze(1)
+        if len(hit) < len(slots):  # A voxel all of whose points had no weight is left as it is.
+            slots, keys, lengths = (each.index_select(0, hit) for each in (slots, keys, lengths))
+            offsets = torch.cat([observations.offsets[:1], observations.offsets[1:].index_select(0, hit)])
+            observations = Pairs(offsets, observations.partners, observations.counts)
+        if not len(slots):
+            return slots
+        added = observations.counts.to(torch.float32) * weights.index_select(0, observations.partners)
+        rows = self._rows_for(slots)
+        old = self._weight_of_row[rows]
+        new = old + torch.segment_reduce(added, "sum", lengths=lengths)
+        seeds = seeds_of(keys, new)
+        self._kernels.merge_means(self.pool, rows, old, new, seeds, observations, added, embeddings)
+        self._weight_of_row[rows] = new
+        return slots
 
     def drop(self, rows: Tensor) -> None:
         """Forget the embeddings and weights in the rows; their storage is reused."""
@@ -95,27 +98,33 @@ class DenseLayer:
         self._weight_of_row[rows] = 0.0
         self.pool.free(rows)
 
-    def restore(self, slots: Tensor, weights: Tensor, embeddings: Tensor) -> None:
-        """Give slots without a dense embedding the stored weights (n,) and means (n, d)."""
-        rows, _ = self._rows_for(slots)
+    def admit(self, slots: Tensor, weights: Tensor) -> Tensor:
+        """Give slots without a dense embedding a row of the weights (n,): (n,) int64 rows, whose means are undefined."""
+        rows = self._rows_for(slots)
         self._weight_of_row[rows] = weights
-        self.pool.write(rows, embeddings)
+        return rows
+
+    @property
+    def link_nbytes(self) -> int:
+        """Allocated bytes of what every voxel has, with a dense embedding or without."""
+        return self._row_of_slot.nbytes
 
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
         return self.pool.nbytes + self._row_of_slot.nbytes + self._slot_of_row.nbytes + self._weight_of_row.nbytes
 
-    def _rows_for(self, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows of the slots, allocating missing ones, and which of them are fresh."""
+    def _rows_for(self, slots: Tensor) -> Tensor:
+        """Rows of distinct slots; those without one get a row of weight 0."""
         rows = self.rows(slots)
         fresh = rows < 0
         count = int(fresh.sum())
         if count:
-            rows[fresh] = self.pool.allocate(count)
+            given = self.pool.allocate(count)
             self._slot_of_row.reserve(self.pool.high_water)
             self._weight_of_row.reserve(self.pool.high_water)
-            self._slot_of_row[rows[fresh]] = slots[fresh].to(torch.int32)
-            self._weight_of_row[rows[fresh]] = 0.0
+            self._slot_of_row[given] = slots.masked_select(fresh).to(torch.int32)
+            self._weight_of_row[given] = 0.0
+            rows.masked_scatter_(fresh, given)
             self._row_of_slot[slots] = rows.to(torch.int32)
-        return rows, fresh
+        return rows

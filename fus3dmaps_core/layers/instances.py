@@ -1,7 +1,9 @@
 """The instance layer M^I: objects as overlapping sets of voxels [sec: Instance-Level Semantic Voxel Mapping].
 
-A voxel holds up to K hypotheses, pairs of an instance id and an observation count. An instance holds an embedding, a weight
-and the fused embedding with its evidence. Ids grow and are never given twice.
+A voxel holds up to K hypotheses, pairs of an instance and an observation count. An instance has an id, which is never given
+twice, and a row under which all that is known of it is kept; rows of instances that died are given to new ones, so that
+memory follows the instances alive. Voxels refer to rows: no voxel refers to the row of an instance that died, for it
+died because none did.
 """
 
 from __future__ import annotations
@@ -10,211 +12,228 @@ import torch
 from torch import Tensor
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxels.columns import Column
-from fus3dmaps_core.voxels.rows import RowPool
+from fus3dmaps_core.kernels.protocols import Extents, Hypotheses, Kernels, Pairs, SlotBlock, VoxelBlock
+from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.rows import RowPool
 
-_MAX_ID = 2**31 - 1
-_COUNT_UNIT = 2**32  # Orders by count first, then by id, in one integer.
+MAX_ID = 2**31 - 1
+"""Ids end here, for messages and files hold them in 32 bits."""
 
 
 class InstanceLayer:
-    """Hypotheses per slot, and everything known of an instance under its id."""
+    """Hypotheses per slot, and everything known of an instance under its row."""
 
-    def __init__(self, dimension: int, max_hypotheses: int, iou_threshold: float, device: torch.device) -> None:
+    def __init__(
+        self, dimension: int, max_hypotheses: int, iou_threshold: float, kernels: Kernels, device: torch.device
+    ) -> None:
         """Start empty; embeddings are float32, for there are few of them."""
+        self._kernels = kernels
         self._device = device
-        self._dimension = dimension
-        self._k = max_hypotheses
         self._iou_threshold = iou_threshold
-        self._hypothesis_id = Column(torch.int32, -1, device, width=max_hypotheses)
-        self._hypothesis_count = Column(torch.int32, 0, device, width=max_hypotheses)
+        self._held_row = Column(torch.int32, -1, device, width=max_hypotheses)
+        self._held_count = Column(torch.int32, 0, device, width=max_hypotheses)
         self.next_id = 0
-        self._alive = 0
-        self._row = Column(torch.int32, -1, device)
-        self._weight = Column(torch.float64, 0.0, device)
-        self._voxels = Column(torch.int32, 0, device)
-        self._observations = Column(torch.int64, 0, device)
-        self._evidence = Column(torch.float64, 0.0, device)
-        self._pool = RowPool(dimension, torch.float32, device)
-        self._fused_pool = RowPool(dimension, torch.float32, device)
+        self.pool = RowPool(dimension, torch.float32, device)
+        self._id_of_row = Column(torch.int64, -1, device)
+        self._weight_of_row = Column(torch.float64, 0.0, device)
+        self._voxels_of_row = Column(torch.int32, 0, device)
+        self._observations_of_row = Column(torch.int64, 0, device)
+        self._changed = Column(torch.bool, False, device)
 
     def __len__(self) -> int:
         """Number of instances alive."""
-        return self._alive
+        return len(self.pool)
 
     def reserve(self, slots: int) -> None:
         """Make slots 0 .. slots - 1 addressable."""
-        self._hypothesis_id.reserve(slots)
-        self._hypothesis_count.reserve(slots)
+        self._held_row.reserve(slots)
+        self._held_count.reserve(slots)
 
-    def ids(self) -> Tensor:
-        """Ids of the instances alive, ascending: (n,) int64."""
-        return torch.nonzero(self._row[: self.next_id] >= 0).squeeze(1)
+    def live(self) -> tuple[Tensor, Tensor]:
+        """Ids of the instances alive, ascending, and their rows: two (n,) int64."""
+        ids = self._id_of_row[: self.pool.high_water]
+        rows = torch.nonzero(ids >= 0).squeeze(1)
+        ordered, order = torch.sort(ids.index_select(0, rows))
+        return ordered, rows.index_select(0, order)
+
+    def ids(self, rows: Tensor) -> Tensor:
+        """Id of each row, -1 for row -1: (n,) int64."""
+        if not self.pool.high_water:
+            return rows
+        return torch.where(rows >= 0, self._id_of_row[rows.clamp(min=0).flatten()].view(rows.shape), -1)
+
+    def held(self) -> Tensor:
+        """Rows that each slot holds, -1 where empty: (slots, K) int32, not a copy."""
+        return self._held_row[:]
 
     def hypotheses(self, slots: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Ids (-1 where empty) and counts of the slots' hypotheses: two (n, K) int64, in no meaningful order."""
-        return self._hypothesis_id[slots].to(torch.int64), self._hypothesis_count[slots].to(torch.int64)
+        """Rows (-1 where empty) and counts of the slots' hypotheses: two (n, K) int64, in no meaningful order."""
+        return self._held_row[slots].to(torch.int64), self._held_count[slots].to(torch.int64)
 
-    def top(self, slots: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Per slot the id with the highest count (ties: the lowest id; -1 without hypothesis) and that count: (n,) int64."""
-        ids, counts = self.hypotheses(slots)
-        column = torch.argmax(counts * _COUNT_UNIT - ids, dim=1, keepdim=True)
-        return ids.gather(1, column).squeeze(1), counts.gather(1, column).squeeze(1)
+    def top(self, slots: Tensor) -> tuple[Tensor, Tensor]:
+        """Per slot the row with the highest count (ties: the lowest id; -1 without any) and that count: (n,) int64."""
+        return self._kernels.top_hypotheses(self._columns(), slots)
 
-    def weights(self, ids: Tensor) -> Tensor:
+    def survey(self, block: SlotBlock, extents: Extents, with_dense: bool, with_instance: bool) -> VoxelBlock:
+        """Add a block's voxels to what instances occupy and pick those that have a layer, as the kernels' protocol says."""
+        return self._kernels.survey(block, self._columns(), extents, with_dense, with_instance)
+
+    def weights(self, rows: Tensor) -> Tensor:
         """Weight w_id: (n,) float64."""
-        return self._weight[ids]
+        return self._weight_of_row[rows]
 
-    def voxels(self, ids: Tensor) -> Tensor:
+    def voxels(self, rows: Tensor) -> Tensor:
         """|V_id|, the voxels that hold the instance as a hypothesis: (n,) int64."""
-        return self._voxels[ids].to(torch.int64)
+        return self._voxels_of_row[rows].to(torch.int64)
 
-    def observations(self, ids: Tensor) -> Tensor:
+    def observations(self, rows: Tensor) -> Tensor:
         """Sum of the instance's counts over V_id: (n,) int64."""
-        return self._observations[ids]
+        return self._observations_of_row[rows]
 
-    def embeddings(self, ids: Tensor) -> Tensor:
-        """Mean embeddings f_id: (n, d) float32."""
-        return self._pool.read(self._row[ids].to(torch.int64))
+    def changed(self) -> Tensor:
+        """Rows of the instances alive whose fusion may have changed since it was settled: (n,) int64 ascending."""
+        return torch.nonzero(self._changed[: self.pool.high_water]).squeeze(1)
 
-    def evidence(self, ids: Tensor) -> Tensor:
-        """Evidence e_id of the stored fused embeddings, 0 before the first fusion: (n,) float64."""
-        return self._evidence[ids]
+    def settle(self, rows: Tensor) -> None:
+        """Note that the fusion of the rows is known."""
+        self._changed[rows] = False
 
-    def fused_embeddings(self, ids: Tensor) -> Tensor:
-        """Stored fused embeddings; f_id itself before an instance's first fusion: (n, d) float32."""
-        rows = self._row[ids].to(torch.int64)
-        fused = self._evidence[ids] > 0
-        values = self._pool.read(rows)
-        values[fused] = self._fused_pool.read(rows[fused])
-        return values
+    def touch(self, slots: Tensor) -> None:
+        """Note that the dense layer has changed in the slots."""
+        held = self._held_row[slots]
+        self._changed[held.masked_select(held >= 0).to(torch.int64)] = True
 
-    def store_fused(self, ids: Tensor, fused: Tensor, evidence: Tensor) -> None:
-        """Replace fused embeddings and evidence of the given instances."""
-        self._fused_pool.write(self._row[ids].to(torch.int64), fused)
-        self._evidence[ids] = evidence
+    def check_room(self, count: int) -> None:
+        """Raise MapError if there are no ids for ``count`` new instances."""
+        if self.next_id + count > MAX_ID:
+            raise MapError(f"the map has given {self.next_id} instance ids and has none for {count} proposals")
+        self.pool.check_room(count)
 
-    def integrate(self, slots: Tensor, counts: Tensor, embedding: Tensor) -> int:
-        """Associate one proposal with an instance, or make a new one, and update both [sec: Geometric Instance Association].
+    def extents(self) -> Extents:
+        """What the instances occupy, before any voxel was added to it: by row."""
+        rows = self.pool.high_water
+        none = torch.zeros(rows, dtype=torch.int64, device=self._device)
+        nowhere = torch.zeros((rows, 3), dtype=torch.int64, device=self._device)
+        far = torch.full_like(nowhere, 2**62)
+        return Extents(voxels=none, counts=none.clone(), sums=nowhere, low=far, high=-far)
+
+    def integrate(self, proposals: Pairs, embeddings: Tensor) -> tuple[Tensor, Tensor]:
+        """Associate proposals with instances, in order, and update both [sec: Geometric Instance Association].
 
         Args:
-            slots: (v,) int64, the distinct slots of V_m.
-            counts: (v,) int64, N_i, the proposal's points in each of them.
-            embedding: (d,) float32 unit vector.
+            proposals: m groups: the distinct slots of V_m, and N_i, the proposal's points in each of them.
+            embeddings: (m, d) float32 unit vectors.
 
         Returns:
-            Id of the instance.
+            Id of each proposal's instance, (m,) int64, -1 for one without points; and rows of the instances that it made.
+
         """
-        held = self._hypothesis_id[slots].to(torch.int64)
-        match = self._associate(held, len(slots))
-        points = int(counts.sum())
-        if match is None:
-            match = self._create()
-        row = self._row[match : match + 1].to(torch.int64)
-        weight = self._weight[match : match + 1]
-        total = weight + points
-        old = self._pool.read(row) if float(weight) else torch.zeros((1, self._dimension), device=self._device)
-        share = (weight / total).to(torch.float32)
-        self._pool.write(row, old * share + embedding * (points / total).to(torch.float32))
-        self._weight[match : match + 1] = total
-        self._observations[match : match + 1] += points
-        self._count(slots, counts, held, match)
-        return match
+        spare = self.pool.allocate(len(embeddings))
+        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
+            column.reserve(self.pool.high_water)
+        outcome = self._kernels.integrate(self._columns(), proposals, spare, self.next_id, self._iou_threshold)
+        self._average(outcome.rows, proposals, embeddings)
+        self.next_id += outcome.created
+        self.pool.free(spare[outcome.created :])
+        self._bury(outcome.dead)
+        return outcome.ids, spare[: outcome.created]
 
-    def restore(self, slots: Tensor, ids: Tensor, counts: Tensor) -> None:
-        """Write the stored hypotheses of slots: ids and counts (n, K)."""
-        self._hypothesis_id[slots] = ids.to(torch.int32)
-        self._hypothesis_count[slots] = counts.to(torch.int32)
-
-    def restore_instances(
-        self, next_id: int, ids: Tensor, weights: Tensor, embeddings: Tensor, fused: Tensor, evidence: Tensor, slots: int
-    ) -> None:
-        """Write the stored instances; voxel and observation counts are recounted from the hypotheses of all slots."""
-        self._reserve_ids(next_id)
-        self.next_id, self._alive = next_id, len(ids)
-        rows = self._pool.allocate(len(ids))
-        self._fused_pool.allocate(len(ids))
-        self._row[ids] = rows.to(torch.int32)
-        self._weight[ids] = weights
-        self._evidence[ids] = evidence
-        self._pool.write(rows, embeddings)
-        self._fused_pool.write(rows, fused)
-        held, counts = self.hypotheses(slice(0, slots))
+    def forget(self, slots: Tensor) -> None:
+        """Empty the hypotheses of distinct slots; instances left without voxel die."""
+        held, counts = self.hypotheses(slots)
         used = held >= 0
-        self._voxels[:next_id] = torch.bincount(held[used], minlength=next_id).to(torch.int32)
-        totals = torch.zeros(next_id, dtype=torch.int64, device=self._device)
-        self._observations[:next_id] = totals.index_add(0, held[used], counts[used])
+        losers, index, lost = torch.unique(held[used], return_inverse=True, return_counts=True)
+        self._voxels_of_row[losers] -= lost.to(torch.int32)
+        self._observations_of_row[losers] -= torch.zeros_like(losers).index_add_(0, index, counts[used])
+        self._changed[losers] = True
+        self._held_row[slots] = -1
+        self._held_count[slots] = 0
+        dead = losers[self._voxels_of_row[losers] == 0]
+        self._id_of_row[dead] = -1
+        self._bury(dead)
+
+    def restore(
+        self, slots: Tensor, ids: Tensor, counts: Tensor, next_id: int, alive: Tensor, weights: Tensor, embeddings: Tensor
+    ) -> Tensor:
+        """Fill an empty layer.
+
+        Args:
+            slots: (n,) slots of all voxels.
+            ids: (n, K) ids of their hypotheses, -1 where empty.
+            counts: (n, K) their counts.
+            next_id: Id of the next new instance.
+            alive: (i,) ids of the instances alive.
+            weights: (i,) w_id.
+            embeddings: (i, d) f_id.
+
+        Returns:
+            Rows of the instances, in the order of ``alive``.
+        """
+        self.next_id = next_id
+        rows = self.pool.allocate(len(alive))
+        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
+            column.reserve(self.pool.high_water)
+        self._id_of_row[rows] = alive
+        self._weight_of_row[rows] = weights
+        self._changed[rows] = True
+        self.pool.write(rows, embeddings)
+        ordered, order = torch.sort(alive)
+        used = ids >= 0
+        held = torch.full_like(ids, -1, dtype=torch.int32)
+        if len(alive):
+            held[used] = rows[order[torch.searchsorted(ordered, ids[used].to(torch.int64))]].to(torch.int32)
+        self._held_row[slots] = held
+        self._held_count[slots] = counts.to(torch.int32)
+        flat = held[used].to(torch.int64)
+        self._voxels_of_row[rows] = torch.bincount(flat, minlength=self.pool.high_water).to(torch.int32)[rows]
+        totals = torch.zeros(self.pool.high_water, dtype=torch.int64, device=self._device)
+        self._observations_of_row[rows] = totals.index_add_(0, flat, counts[used].to(torch.int64))[rows]
+        return rows
 
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
         columns = (
-            self._hypothesis_id,
-            self._hypothesis_count,
-            self._row,
-            self._weight,
-            self._voxels,
-            self._observations,
-            self._evidence,
+            self._held_row,
+            self._held_count,
+            self._id_of_row,
+            self._weight_of_row,
+            self._voxels_of_row,
+            self._observations_of_row,
+            self._changed,
         )
-        return self._pool.nbytes + self._fused_pool.nbytes + sum(column.nbytes for column in columns)
+        return self.pool.nbytes + sum(column.nbytes for column in columns)
 
-    def _associate(self, held: Tensor, size: int) -> int | None:
-        """The instance with the largest IoU above the threshold among those held by the proposal's voxels."""
-        candidates, shared = torch.unique(held[held >= 0], return_counts=True)
-        if not len(candidates):
-            return None
-        # Correctly rounded float64 quotients: equal ratios compare equal, and 1/5 is not above 0.2.
-        iou = shared.to(torch.float64) / (size + self.voxels(candidates) - shared).to(torch.float64)
-        best = float(iou.max())
-        if best <= self._iou_threshold:
-            return None
-        return int(candidates[iou == best].min())
+    def _columns(self) -> Hypotheses:
+        rows = slice(0, self.pool.high_water)
+        return Hypotheses(
+            self._held_row[:],
+            self._held_count[:],
+            self._id_of_row[rows],
+            self._voxels_of_row[rows],
+            self._observations_of_row[rows],
+            self._changed[rows],
+        )
 
-    def _create(self) -> int:
-        if self.next_id > _MAX_ID:
-            raise MapError("the map has used up its instance ids")
-        created, self.next_id = self.next_id, self.next_id + 1
-        self._alive += 1
-        self._reserve_ids(self.next_id)
-        self._row[created : created + 1] = self._pool.allocate(1).to(torch.int32)
-        self._fused_pool.allocate(1)  # Both pools see the same sequence of calls, hence the same row.
-        return created
+    def _average(self, rows: Tensor, proposals: Pairs, embeddings: Tensor) -> None:
+        """f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the proposals given to an instance."""
+        given = torch.nonzero(rows >= 0).squeeze(1)
+        if not len(given):
+            return
+        owners, place, _ = self._kernels.distinct(rows[given])
+        groups = self._kernels.count_pairs(place, given, len(owners), len(rows))
+        ends = torch.zeros(len(proposals.counts) + 1, dtype=torch.int64, device=self._device)
+        ends[1:] = torch.cumsum(proposals.counts, 0)
+        points = ends.index_select(0, proposals.offsets).diff().index_select(0, groups.partners)
+        old = self._weight_of_row[owners]
+        new = old + torch.segment_reduce(points.to(torch.float64), "sum", lengths=groups.offsets.diff())
+        weights = (old.to(torch.float32), new.to(torch.float32))
+        amounts, seeds = points.to(torch.float32), torch.zeros_like(owners)
+        self._kernels.merge_means(self.pool, owners, *weights, seeds, groups, amounts, embeddings)
+        self._weight_of_row[owners] = new
 
-    def _reserve_ids(self, ids: int) -> None:
-        for column in (self._row, self._weight, self._voxels, self._observations, self._evidence):
-            column.reserve(ids)
-
-    def _count(self, slots: Tensor, counts: Tensor, held: Tensor, instance: int) -> None:
-        """Add the counts to the instance's hypotheses, displacing the weakest one of a full voxel."""
-        is_own = held == instance
-        known = is_own.any(dim=1)
-        had = self._hypothesis_count[slots].to(torch.int64)
-        # Empty places first (by position), then the lowest count, then the oldest id.
-        preference = torch.where(held < 0, torch.arange(self._k, device=self._device) - self._k, had * _COUNT_UNIT + held)
-        column = torch.where(known, is_own.to(torch.int64).argmax(dim=1), preference.argmin(dim=1))[:, None]
-        old_id, old_count = held.gather(1, column).squeeze(1), had.gather(1, column).squeeze(1)
-        held.scatter_(1, column, instance)
-        had.scatter_(1, column, (counts + torch.where(known, old_count, 0))[:, None])
-        self._hypothesis_id[slots] = held.to(torch.int32)
-        self._hypothesis_count[slots] = had.to(torch.int32)
-        self._voxels[instance : instance + 1] += int((~known).sum())
-        displaced = ~known & (old_id >= 0)
-        if bool(displaced.any()):
-            self._displace(old_id[displaced], old_count[displaced])
-
-    def _displace(self, ids: Tensor, counts: Tensor) -> None:
-        """Take voxels and counts from instances that lost a hypothesis, and delete those left with none."""
-        losers, index, lost = torch.unique(ids, return_inverse=True, return_counts=True)
-        self._voxels[losers] -= lost.to(torch.int32)
-        lost_counts = torch.zeros(len(losers), dtype=torch.int64, device=self._device).index_add_(0, index, counts)
-        self._observations[losers] -= lost_counts
-        dead = losers[self._voxels[losers] == 0]
-        if len(dead):
-            rows = self._row[dead].to(torch.int64)
-            self._pool.free(rows)
-            self._fused_pool.free(rows)
-            self._row[dead] = -1
-            for column in (self._weight, self._observations, self._evidence):
-                column[dead] = 0
-            self._alive -= len(dead)
+    def _bury(self, dead: Tensor) -> None:
+        """Give up the rows of instances without voxels."""
+        for column in (self._weight_of_row, self._observations_of_row, self._changed):
+            column[dead] = 0
+        self.pool.free(dead)

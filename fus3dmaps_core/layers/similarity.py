@@ -1,75 +1,84 @@
-"""Cosine similarities of text embeddings with each layer, block by block so that memory stays bounded."""
+"""Cosines of texts with one layer, for some voxels at a time, so that memory stays bounded at any map size."""
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import torch
 from torch import Tensor
-from torch.nn.functional import normalize
 
+from fus3dmaps_core.kernels.protocols import Kernels, VoxelBlock
 from fus3dmaps_core.layers.dense import DenseLayer
-from fus3dmaps_core.layers.fusion import fuse_voxels
-from fus3dmaps_core.layers.instances import InstanceLayer
+from fus3dmaps_core.layers.fused_instances import FusedInstances
+from fus3dmaps_core.layers.fusion import FusionInputs
 
 
-def dense_similarity(dense: DenseLayer, texts: Tensor) -> tuple[Tensor, Tensor]:
-    """Similarities of the dense layer: slots (n,) int64 and cosines (n, p) float32 with texts (p, d) of unit length."""
-    parts = [(slots, normalize(means, dim=1) @ texts.T) for slots, _, means in dense.live_blocks()]
-    return _ordered(parts, texts)
+class LayerCosines(Protocol):
+    """Cosines of one layer with the texts that it was made for.
 
-
-def instance_similarity(instances: InstanceLayer, embeddings: Tensor, slots: int, texts: Tensor) -> tuple[Tensor, Tensor]:
-    """Similarities of an instance layer, per voxel those of its top hypothesis.
-
-    Args:
-        instances: The layer.
-        embeddings: (i, d) float32, one per instance alive in the order of ``instances.ids()``: raw or fused.
-        slots: Number of slots of the map.
-        texts: (p, d) unit vectors.
-
-    Returns:
-        As :func:`dense_similarity`.
+    Attributes:
+        with_dense: Whether voxels that have a dense embedding have this layer.
+        with_instance: Whether voxels that have a hypothesis have this layer.
     """
-    cosines = normalize(embeddings, dim=1) @ texts.T
-    top, _ = instances.top(slice(0, slots))
-    held = torch.nonzero(top >= 0).squeeze(1)
-    return held, cosines[_place(instances)[top[held]]]
+
+    with_dense: bool
+    with_instance: bool
+
+    def __call__(self, voxels: VoxelBlock) -> Tensor:
+        """Cosines of n voxels that have the layer: (n, p) float32."""
+        ...
 
 
-def fused_dense_similarity(
-    dense: DenseLayer, instances: InstanceLayer, slots: int, variance_ratio: float, texts: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Similarities of the fused dense layer, which covers every voxel that has either layer.
+class DenseCosines:
+    """The dense layer."""
 
-    Returns:
-        As :func:`dense_similarity`.
+    with_dense, with_instance = True, False
+
+    def __init__(self, kernels: Kernels, dense: DenseLayer, texts: Tensor) -> None:
+        """For texts (p, d) of unit length."""
+        self._kernels, self._dense, self._texts = kernels, dense, texts
+
+    def __call__(self, voxels: VoxelBlock) -> Tensor:
+        """As the protocol says."""
+        return self._kernels.cosines(self._dense.pool, voxels.dense_rows, self._texts)
+
+
+class FusedDenseCosines:
+    """The fused dense layer, which covers every voxel that has either layer.
+
+    f_fused,i = (w_i^D f_i^D + lambda c_i f_top(i)) / (w_i^D + lambda c_i), where c_i is the count of the top hypothesis; a
+    voxel with one layer only takes that layer's embedding.
     """
-    own = instances.embeddings(instances.ids())
-    place = _place(instances)
-    parts = []
-    for held, weights, means in dense.live_blocks():
-        top, counts = instances.top(held)
-        with_instance = top >= 0
-        embeddings = torch.zeros_like(means)
-        embeddings[with_instance] = own[place[top[with_instance]]]
-        fused = fuse_voxels(weights, means, counts, embeddings, variance_ratio)
-        parts.append((held, normalize(fused, dim=1) @ texts.T))
-    without_dense = torch.nonzero(dense.rows(slice(0, slots)) < 0).squeeze(1)
-    top, _ = instances.top(without_dense)
-    held = top >= 0
-    parts.append((without_dense[held], (normalize(own, dim=1) @ texts.T)[place[top[held]]]))
-    return _ordered(parts, texts)
+
+    with_dense, with_instance = True, True
+
+    def __init__(self, inputs: FusionInputs, texts: Tensor) -> None:
+        """For texts (p, d) of unit length."""
+        self._inputs, self._texts = inputs, texts
+
+    def __call__(self, voxels: VoxelBlock) -> Tensor:
+        """As the protocol says."""
+        dense, rows = self._inputs.dense, voxels.dense_rows
+        own_weights = self._inputs.variance_ratio * voxels.top_counts.to(torch.float32)
+        own = (self._inputs.instances.pool, voxels.top_rows, own_weights)
+        return self._inputs.kernels.fused_cosines(dense.pool, rows, dense.weights(rows), *own, self._texts)
 
 
-def _place(instances: InstanceLayer) -> Tensor:
-    """Row of each id among the instances alive, -1 elsewhere."""
-    ids = instances.ids()
-    place = torch.full((instances.next_id,), -1, dtype=torch.int64, device=ids.device)
-    place[ids] = torch.arange(len(ids), device=ids.device)
-    return place
+class InstanceCosines:
+    """An instance layer: per voxel the embedding of its top hypothesis, raw or fused."""
 
+    with_dense, with_instance = False, True
 
-def _ordered(parts: list[tuple[Tensor, Tensor]], texts: Tensor) -> tuple[Tensor, Tensor]:
-    if not parts:
-        return torch.zeros(0, dtype=torch.int64, device=texts.device), texts.new_zeros((0, len(texts)))
-    slots, order = torch.sort(torch.cat([part[0] for part in parts]))
-    return slots, torch.cat([part[1] for part in parts])[order]
+    def __init__(self, inputs: FusionInputs, fused: FusedInstances | None, texts: Tensor, instance_rows: Tensor) -> None:
+        """For texts (p, d) of unit length and the rows of all instances alive; raw without ``fused``."""
+        if fused is None:
+            cosines = inputs.kernels.cosines(inputs.instances.pool, instance_rows, texts)
+        else:
+            cosines = fused.cosines(inputs, instance_rows, texts)
+        self._cosines = cosines
+        self._place = torch.full((inputs.instances.pool.high_water,), -1, dtype=torch.int64, device=texts.device)
+        self._place[instance_rows] = torch.arange(len(instance_rows), device=texts.device)
+
+    def __call__(self, voxels: VoxelBlock) -> Tensor:
+        """As the protocol says."""
+        return self._cosines.index_select(0, self._place.index_select(0, voxels.top_rows))

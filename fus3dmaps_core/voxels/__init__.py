@@ -1,1 +1,1 @@
-"""The voxel hash and the pooled storage of embedding rows."""
+"""The voxel hash."""

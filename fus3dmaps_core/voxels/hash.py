@@ -1,8 +1,7 @@
-"""The voxel hash: integer voxel coordinates to stable slots, in batches.
+"""The voxel hash: packed voxel keys to stable slots, in batches.
 
-Coordinates are packed into one 63-bit key, 21 signed bits an axis (52 km either way at 5 cm), and kept in an
-open-addressing table with linear probing. Slots are dense numbers in the order of insertion and never move, so every
-other property of a voxel is a column indexed by slot.
+Keys are kept in an open-addressing table with linear probing. A voxel's slot never changes while the voxel is in the map, so
+every other property of it is a column indexed by slot; slots of removed voxels are given to new ones.
 """
 
 from __future__ import annotations
@@ -11,120 +10,119 @@ import torch
 from torch import Tensor
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxels.columns import Column
+from fus3dmaps_core.kernels.keys import unpack
+from fus3dmaps_core.kernels.protocols import EMPTY, HashTable, Kernels
+from fus3dmaps_core.memory.columns import Column
 
-_BITS = 21
-_HALF = 1 << (_BITS - 1)
-_EMPTY = -1
-_MULTIPLIER = -7046029254386353131  # 2^64 / golden ratio as a signed 64-bit integer (Fibonacci hashing)
-_MAX_LOAD = 0.5  # Linear probing stays at one or two probes up to here.
-
-MAX_COORDINATE = _HALF - 1
-"""Largest voxel coordinate of either sign."""
-
-
-def pack(coordinates: Tensor) -> Tensor:
-    """Keys of (n, 3) integer voxel coordinates: (n,) int64, not negative.
-
-    Raises:
-        MapError: A coordinate is beyond +-MAX_COORDINATE.
-    """
-    if coordinates.numel() and int(coordinates.abs().max()) > MAX_COORDINATE:
-        raise MapError(f"voxel coordinate {int(coordinates.abs().max())} is beyond the map's range of +-{MAX_COORDINATE}")
-    x, y, z = (coordinates.to(torch.int64) + _HALF).unbind(1)
-    return (x << (2 * _BITS)) | (y << _BITS) | z
-
-
-def unpack(keys: Tensor) -> Tensor:
-    """Voxel coordinates of keys: (n, 3) int64."""
-    mask = (1 << _BITS) - 1
-    return torch.stack([(keys >> (2 * _BITS)) & mask, (keys >> _BITS) & mask, keys & mask], dim=1) - _HALF
+_MAX_LOAD = 0.5  # Linear probing stays at one or two probes up to here; deleted cells count.
+_MAX_SLOTS = 2**31 - 1  # Slots are held in 32-bit columns.
 
 
 class VoxelHash:
-    """Finds or inserts batches of keys; a key keeps its slot for the life of the map."""
+    """Finds, inserts and removes batches of keys."""
 
-    def __init__(self, device: torch.device) -> None:
+    def __init__(self, kernels: Kernels, device: torch.device) -> None:
         """Start empty on the given device."""
+        self._kernels = kernels
         self._device = device
-        self._count = 0
-        self._keys = Column(torch.int64, _EMPTY, device)
-        self._allocate_table(1024)
+        self._keys = Column(torch.int64, EMPTY, device)
+        self._high = 0
+        self._free = Column(torch.int32, -1, device)
+        self._free_count = 0
+        self._table = self._new_table(1024)
+        self._used_cells = 0
 
     def __len__(self) -> int:
-        """Number of voxels, which is also the next slot."""
-        return self._count
+        """Number of voxels."""
+        return self._high - self._free_count
 
-    def keys(self, slots: Tensor | slice | None = None) -> Tensor:
-        """Keys of the slots, or of all slots in order."""
-        return self._keys[slice(0, self._count) if slots is None else slots]
+    @property
+    def high_water(self) -> int:
+        """One more than the largest slot ever given."""
+        return self._high
 
-    def coordinates(self, slots: Tensor | slice | None = None) -> Tensor:
-        """Voxel coordinates of the slots, or of all slots in order: (n, 3) int64."""
+    def keys(self, slots: Tensor | slice) -> Tensor:
+        """Keys of the slots, EMPTY where a slot has no voxel."""
+        return self._keys[slots]
+
+    def live(self) -> Tensor:
+        """Slots of all voxels, ascending: (n,) int64."""
+        return torch.nonzero(self._keys[: self._high] != EMPTY).squeeze(1)
+
+    def coordinates(self, slots: Tensor | slice) -> Tensor:
+        """Voxel coordinates of slots that have a voxel: (n, 3) int64."""
         return unpack(self.keys(slots))
 
     def find(self, keys: Tensor) -> Tensor:
         """Slots of the keys, -1 where a key is not in the map: (n,) int64."""
-        slots = torch.full_like(keys, -1)
-        rows = torch.arange(len(keys), device=self._device)
-        cells = self._home(keys)
-        while len(rows):
-            found = self._table_keys[cells]
-            hit = found == keys[rows]
-            slots[rows[hit]] = self._table_slots[cells[hit]].to(torch.int64)
-            onward = ~hit & (found != _EMPTY)
-            rows, cells = rows[onward], (cells[onward] + 1) & self._mask
-        return slots
+        return self._kernels.find(self._table, keys)
 
     def find_or_insert(self, keys: Tensor) -> Tensor:
-        """Slots of distinct keys; missing ones get the next slots in the order given.
+        """Slots of distinct keys; missing ones get free slots, those given up last first, then new ones.
 
         Args:
             keys: (n,) int64 packed keys without repetition.
 
         Returns:
             (n,) int64 slots.
+
+        Raises:
+            MapError: There would be more voxels than 32-bit slots can tell apart; nothing was inserted.
         """
         slots = self.find(keys)
         missing = slots < 0
-        fresh = keys[missing]
-        if len(fresh):
-            first, self._count = self._count, self._count + len(fresh)
-            slots[missing] = torch.arange(first, self._count, device=self._device)
-            self._keys.reserve(self._count)
-            self._keys[first : self._count] = fresh
-            if self._count > _MAX_LOAD * (self._mask + 1):
-                capacity = self._mask + 1
-                while self._count > _MAX_LOAD * capacity:
-                    capacity *= 2
-                self._allocate_table(capacity)
-                self._place(self.keys(), torch.arange(self._count, device=self._device))
-            else:
-                self._place(fresh, slots[missing])
+        fresh = keys.masked_select(missing)
+        if not len(fresh):
+            return slots
+        if len(self) + len(fresh) > _MAX_SLOTS:
+            raise MapError(f"the map holds {len(self)} voxels and cannot number {len(fresh)} more")
+        given = self._take_slots(len(fresh))
+        slots.masked_scatter_(missing, given)
+        self._keys[given] = fresh
+        if self._used_cells + len(fresh) > _MAX_LOAD * len(self._table.keys):
+            self._rebuild()
+        else:
+            self._kernels.place(self._table, fresh, given)
+            self._used_cells += len(fresh)
         return slots
+
+    def remove(self, slots: Tensor) -> None:
+        """Forget the voxels of distinct slots; the slots will be given to others."""
+        self._kernels.bury(self._table, self._keys[slots])
+        self._keys[slots] = EMPTY
+        self._free.reserve(self._free_count + len(slots))
+        self._free[self._free_count : self._free_count + len(slots)] = slots.to(torch.int32)
+        self._free_count += len(slots)
 
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
-        tables = (self._table_keys, self._table_slots)
-        return self._keys.nbytes + sum(table.numel() * table.element_size() for table in tables)
+        tables = (self._table.keys, self._table.slots)
+        return self._keys.nbytes + self._free.nbytes + sum(table.numel() * table.element_size() for table in tables)
 
-    def _allocate_table(self, capacity: int) -> None:
-        self._mask = capacity - 1
-        self._shift = 64 - capacity.bit_length() + 1
-        self._table_keys = torch.full((capacity,), _EMPTY, dtype=torch.int64, device=self._device)
-        self._table_slots = torch.full((capacity,), -1, dtype=torch.int32, device=self._device)
+    def _take_slots(self, count: int) -> Tensor:
+        reused = min(count, self._free_count)
+        slots = torch.empty(count, dtype=torch.int64, device=self._device)
+        slots[:reused] = self._free[self._free_count - reused : self._free_count].to(torch.int64)
+        self._free_count -= reused
+        slots[reused:] = torch.arange(self._high, self._high + count - reused, device=self._device)
+        self._high += count - reused
+        self._keys.reserve(self._high)
+        return slots
 
-    def _home(self, keys: Tensor) -> Tensor:
-        return ((keys * _MULTIPLIER) >> self._shift) & self._mask
+    def _new_table(self, cells: int) -> HashTable:
+        return HashTable(
+            torch.full((cells,), EMPTY, dtype=torch.int64, device=self._device),
+            torch.full((cells,), -1, dtype=torch.int32, device=self._device),
+        )
 
-    def _place(self, keys: Tensor, slots: Tensor) -> None:
-        """Put keys that are not in the table into it."""
-        cells = self._home(keys)
-        while len(keys):
-            free = self._table_keys[cells] == _EMPTY
-            # Several keys may claim one cell: one write survives, whose key reads back; the others probe on.
-            self._table_keys[cells[free]] = keys[free]
-            won = free & (self._table_keys[cells] == keys)
-            self._table_slots[cells[won]] = slots[won].to(torch.int32)
-            keys, slots, cells = keys[~won], slots[~won], (cells[~won] + 1) & self._mask
+    def _rebuild(self) -> None:
+        """Make a table of all keys: a larger one, or as large as before where deleted cells had filled it."""
+        cells = len(self._table.keys)
+        # Half of the allowed load stays free, so that the next rebuilding is as many insertions away.
+        while len(self) > 0.5 * _MAX_LOAD * cells:
+            cells *= 2
+        self._table = self._new_table(cells)
+        slots = self.live()
+        self._kernels.place(self._table, self._keys[slots], slots)
+        self._used_cells = len(slots)

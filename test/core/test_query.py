@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.agreement import KnownTexts, apply_to_both, assert_same_answer, engine_of, reference_of
 from reference.steps import Setting, embeddings_of, random_steps
+from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import QueryError
@@ -191,11 +192,14 @@ def test_an_embedding_that_cancelled_out_is_like_nothing():
     np.testing.assert_array_equal(ask(semantic_map, "x", layer="dense").similarity, [0.0])
 
 
+@pytest.mark.parametrize(("backend", "device"), BACKENDS, ids=BACKEND_IDS)
 @pytest.mark.parametrize("window_radius_m", [0.0, 0.16])
-@settings(max_examples=12)
+@settings(max_examples=8)
 @given(st.integers(0, 2**32 - 1), st.integers(5, 25))
-def test_a_query_does_not_change_the_map_and_agrees_with_the_reference(window_radius_m: float, seed: int, count: int):
-    setting = Setting(window_radius_m=window_radius_m)
+def test_a_query_does_not_change_the_map_and_agrees_with_the_reference(
+    window_radius_m: float, backend: str, device: str, seed: int, count: int
+):
+    setting = Setting(window_radius_m=window_radius_m, backend=backend, device=device)
     engine, reference = engine_of(setting), reference_of(setting)
     for step in random_steps(setting, extent=2, count=count, seed=seed):
         apply_to_both(step, engine, reference)

@@ -103,7 +103,8 @@ def test_every_package_folder_and_data_file_is_packaged(root, distribution):
         folders = {path.parent for path in (root / name).rglob("*.py")}
         assert {".".join(folder.relative_to(root).parts) for folder in folders} <= packages
         patterns = distribution.package_data[name]
-        data = [path for path in (root / name).rglob("*") if path.is_file() and path.suffix not in {".py", ".pyc"}]
+        inside = (path for path in (root / name).rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+        data = [path for path in inside if path.suffix != ".py"]
         assert [path for path in data if not any(path.relative_to(root / name).match(pattern) for pattern in patterns)] == []
 
 

@@ -21,12 +21,21 @@ class Instance:
     evidence: float = 0.0
 
 
+@dataclass(frozen=True)
+class Fusion:
+    """What one fusion did; ``recomputed`` only where it has one answer."""
+
+    updated: int
+    recomputed: int | None
+
+
 @dataclass
 class ReferenceMap:
     """Every quantity of the method under its own name, updated one point, voxel or instance at a time.
 
-    ``seen`` counts the branches that were taken, so that a test can tell whether its sequence reached them;
-    ``most_dense_updates`` is the largest number of frames behind one dense mean, each of which may round it once.
+    ``seen`` counts the branches that were taken, so that a test can tell whether its sequence reached them.
+    ``dense_roundings`` is how many roundings a dense mean of low precision may be off by: each write adds at most one, and
+    those before it weigh as much as the mean that they are in. ``most_dense_roundings`` is the largest there ever was.
     """
 
     voxel_size_m: float
@@ -39,8 +48,8 @@ class ReferenceMap:
     color: dict[Key, Vector] = field(default_factory=dict)
     dense_weight: dict[Key, float] = field(default_factory=dict)
     dense_mean: dict[Key, Vector] = field(default_factory=dict)
-    dense_updates: Counter[Key] = field(default_factory=Counter)
-    most_dense_updates: int = 0
+    dense_roundings: dict[Key, float] = field(default_factory=dict)
+    most_dense_roundings: float = 0.0
     hypotheses: dict[Key, dict[int, int]] = field(default_factory=dict)
     instances: dict[int, Instance] = field(default_factory=dict)
     dropped_keys: set[Key] = field(default_factory=set)
@@ -73,8 +82,8 @@ class ReferenceMap:
             mean = self.dense_mean.get(key, np.zeros_like(arrived_sum[key]))
             self.dense_mean[key] = (old * mean + arrived_sum[key]) / (old + weight)
             self.dense_weight[key] = old + weight
-            self.dense_updates[key] += 1
-            self.most_dense_updates = max(self.most_dense_updates, self.dense_updates[key])
+            self.dense_roundings[key] = old / (old + weight) * self.dense_roundings.get(key, 0.0) + 1.0
+            self.most_dense_roundings = max(self.most_dense_roundings, self.dense_roundings[key])
 
     # ---- instance layer
 
@@ -126,10 +135,13 @@ class ReferenceMap:
                     self.seen["hypothesis_pruned_tie"] += 1
                 del counts[min(other for other, count in counts.items() if count == lowest)]
             counts[instance_id] = counts.get(instance_id, 0) + hits[key]
-        for other in [each for each in self.instances if not self.voxels_of(each)]:
-            self.seen["instance_deleted"] += 1
-            del self.instances[other]
+        self._delete_instances_without_voxels("instance_deleted")
         return instance_id
+
+    def _delete_instances_without_voxels(self, branch: str) -> None:
+        for other in [each for each in self.instances if not self.voxels_of(each)]:
+            self.seen[branch] += 1
+            del self.instances[other]
 
     def _associate(self, voxels: set[Key]) -> int | None:
         overlap: dict[int, float] = {}
@@ -172,8 +184,8 @@ class ReferenceMap:
         weight, support = self.dense_weight[key], self.variance_ratio * self.hypotheses[key][top]
         return (weight * self.dense_mean[key] + support * self.instances[top].embedding) / (weight + support)
 
-    def fuse(self) -> int:
-        """Store fusion of every instance; with a window only where evidence grew. Returns how many were stored."""
+    def fuse(self, full: bool = False) -> Fusion:
+        """Store fusion of every instance; with a window only where evidence grew."""
         updated = 0
         for instance_id, instance in self.instances.items():
             fused, evidence = self.fused_instance(instance_id)
@@ -183,7 +195,7 @@ class ReferenceMap:
             self.seen["fusion_replaced"] += 1
             instance.fused_embedding, instance.evidence = fused, evidence
             updated += 1
-        return updated
+        return Fusion(updated, len(self.instances) if full else None)
 
     def query_embedding(self, instance_id: int) -> Vector:
         """What layer fused_instances answers with: fresh without a window, what was stored with one."""
@@ -202,7 +214,22 @@ class ReferenceMap:
             key for key in self.dense_weight if math.dist(center_of(key, self.voxel_size_m), center_m) > self.window_radius_m
         ]
         for key in far:
-            del self.dense_weight[key], self.dense_mean[key], self.dense_updates[key]
+            del self.dense_weight[key], self.dense_mean[key], self.dense_roundings[key]
             self.dropped_keys.add(key)
         self.seen["window_dropped"] += len(far)
         return len(far)
+
+    # ---- removal
+
+    def remove_voxels(self, points_m) -> int:
+        """Forget the voxels that hold the points; instances left without one die. Returns how many there were."""
+        gone = {voxel_of(point, self.voxel_size_m) for point in points_m} & self.voxels
+        for key in gone:
+            self.voxels.remove(key)
+            self.seen["removed_dense"] += key in self.dense_weight
+            self.seen["removed_hypotheses"] += bool(self.hypotheses.get(key))
+            for known in (self.color, self.dense_weight, self.dense_mean, self.dense_roundings, self.hypotheses):
+                known.pop(key, None)
+            self.dropped_keys.discard(key)
+        self._delete_instances_without_voxels("instance_removed")
+        return len(gone)

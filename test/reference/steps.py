@@ -1,4 +1,4 @@
-"""Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, fusions.
+"""Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, removals, fusions.
 
 A step applies to the reference and to the package's map alike, for both have the same methods. Points lie inside their
 voxel, away from its walls, and dense weights are multiples of 1/64, so that sums are exact and comparisons of evidence have
@@ -7,7 +7,7 @@ one answer.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,8 @@ class Setting:
     window_radius_m: float = 0.0
     dimension: int = 5
     dtype: str = "float32"
+    backend: str = "auto"
+    device: str = "cpu"
 
 
 @dataclass(frozen=True)
@@ -66,15 +68,26 @@ class WindowStep:
 
 
 @dataclass(frozen=True)
+class RemoveStep:
+    """Argument of remove_voxels."""
+
+    points_m: np.ndarray
+
+    def apply(self, target: Any) -> Any:
+        return target.remove_voxels(self.points_m)
+
+
+@dataclass(frozen=True)
 class FuseStep:
     """A fusion."""
 
+    full: bool = False
+
     def apply(self, target: Any) -> Any:
-        report = target.fuse()
-        return getattr(report, "updated", report)
+        return target.fuse(self.full)
 
 
-Step = DenseStep | ProposalStep | WindowStep | FuseStep
+Step = DenseStep | ProposalStep | WindowStep | RemoveStep | FuseStep
 
 
 def points_in(keys: np.ndarray, voxel_size_m: float, rng: np.random.Generator) -> np.ndarray:
@@ -116,6 +129,11 @@ def proposal_step(masks: list[list[Key]], setting: Setting, rng: np.random.Gener
     )
 
 
+def remove_step(keys: list[Key], setting: Setting, rng: np.random.Generator) -> RemoveStep:
+    """Removal of voxels, which may repeat or be missing."""
+    return RemoveStep(points_in(np.array(keys).reshape(-1, 3), setting.voxel_size_m, rng))
+
+
 def random_box(extent: int, rng: np.random.Generator) -> list[Key]:
     """Voxels of a random box in [-extent, extent)^3, with holes and repetitions."""
     low = rng.integers(-extent, extent, 3)
@@ -138,10 +156,13 @@ def random_steps(setting: Setting, extent: int, count: int, seed: int) -> list[S
         elif kind < 0.75:
             masks = [random_box(extent, rng) if rng.random() < 0.95 else [] for _ in range(rng.integers(1, 7))]
             steps.append(proposal_step(masks, setting, rng))
-        elif kind < 0.9:
+        elif kind < 0.85:
             steps.append(WindowStep(rng.uniform(-extent, extent, 3) * setting.voxel_size_m))
+        elif kind < 0.9:
+            everything = [tuple(int(each) - extent for each in key) for key in np.ndindex(*[2 * extent] * 3)]
+            steps.append(remove_step(everything if rng.random() < 0.15 else random_box(extent, rng), setting, rng))
         else:
-            steps.append(FuseStep())
+            steps.append(FuseStep(full=rng.random() < 0.3))
     return steps
 
 
@@ -168,13 +189,12 @@ def _boxes(draw: st.DrawFn) -> list[Key]:
 
 
 @st.composite
-def sequences(draw: st.DrawFn, dtype: str = "float32", max_steps: int = 12) -> tuple[Setting, list[Step]]:
-    """A map's setting and what happens to it; shrinks in the number of steps, masks and voxels."""
-    setting = draw(settings_of_maps)
-    setting = Setting(**{**setting.__dict__, "dtype": dtype})
-    kinds = draw(st.lists(st.sampled_from(["dense", "proposals", "proposals", "window", "fuse"]), max_size=max_steps))
+def sequences(draw: st.DrawFn, max_steps: int = 12, **fixed: Any) -> tuple[Setting, list[Step]]:
+    """A map's setting, of which some fields may be given, and what happens to it; shrinks in steps, masks and voxels."""
+    setting = replace(draw(settings_of_maps), **fixed)
+    kinds = ["dense", "proposals", "proposals", "window", "remove", "fuse"]
     steps: list[Step] = []
-    for kind in kinds:
+    for kind in draw(st.lists(st.sampled_from(kinds), max_size=max_steps)):
         rng = np.random.default_rng(draw(_seeds))
         if kind == "dense":
             steps.append(dense_step(draw(st.lists(_cells, max_size=20)), setting, rng))
@@ -183,6 +203,8 @@ def sequences(draw: st.DrawFn, dtype: str = "float32", max_steps: int = 12) -> t
             steps.append(proposal_step(masks, setting, rng))
         elif kind == "window":
             steps.append(WindowStep(rng.uniform(-2.5, 2.5, 3) * setting.voxel_size_m))
+        elif kind == "remove":
+            steps.append(remove_step(draw(st.one_of(_boxes(), st.lists(_cells, max_size=4))), setting, rng))
         else:
-            steps.append(FuseStep())
+            steps.append(FuseStep(draw(st.booleans())))
     return setting, steps

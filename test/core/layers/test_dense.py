@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.agreement import ROUNDING, dense_embeddings
 from reference.steps import DenseStep, Setting, dense_step
+from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.semantic_map import SemanticMap
@@ -17,8 +20,15 @@ VOXEL = np.array([0.02, 0.02, 0.02])
 GREY = np.full(3, 90, np.uint8)
 
 
-def a_map(dimension: int = 3, dtype: str = "float32", radius_m: float = 0.0) -> SemanticMap:
-    return SemanticMap(dimension, MapConfig(dtype=dtype), 1.0, radius_m)
+@pytest.fixture(scope="module", params=BACKENDS, ids=BACKEND_IDS)
+def a_map(request) -> Callable[..., SemanticMap]:
+    """Makes a map on each of the backends."""
+    backend, device = request.param
+
+    def make(dimension: int = 3, dtype: str = "float32", radius_m: float = 0.0) -> SemanticMap:
+        return SemanticMap(dimension, MapConfig(dtype=dtype, backend=backend, device=device), 1.0, radius_m)
+
+    return make
 
 
 def observe(semantic_map: SemanticMap, embeddings, weights, patches=None, points_m=None) -> None:
@@ -32,11 +42,11 @@ def observe(semantic_map: SemanticMap, embeddings, weights, patches=None, points
 
 def dense_of(semantic_map: SemanticMap) -> dict[tuple[int, ...], tuple[float, np.ndarray]]:
     state = semantic_map.export_state()
-    rows = zip(state["dense_slot"], state["dense_weight"], state["dense_embedding"], strict=True)
-    return {tuple(state["voxel_coordinates"][slot].tolist()): (float(w), f.astype(float)) for slot, w, f in rows}
+    rows = zip(state["dense_slot"], state["dense_weight"], dense_embeddings(state), strict=True)
+    return {tuple(state["voxel_coordinates"][slot].tolist()): (float(w), f) for slot, w, f in rows}
 
 
-def test_the_mean_is_weighted_and_not_renormalised():
+def test_the_mean_is_weighted_and_not_renormalised(a_map):
     semantic_map = a_map()
     observe(semantic_map, [[1, 0, 0]], [1.0])
     observe(semantic_map, [[0, 1, 0], [0, 0, 1]], [0.5, 0.25], patches=[0, 0, 1, 1])
@@ -47,13 +57,13 @@ def test_the_mean_is_weighted_and_not_renormalised():
     assert np.linalg.norm(mean) < 0.9
 
 
-def test_observations_are_normalised_before_they_are_averaged():
+def test_observations_are_normalised_before_they_are_averaged(a_map):
     semantic_map = a_map()
     observe(semantic_map, [[3e4, 0, 0], [0, 1e-4, 0]], [1.0, 1.0])
     np.testing.assert_allclose(dense_of(semantic_map)[0, 0, 0][1], [0.5, 0.5, 0], atol=1e-6)
 
 
-def test_a_patch_of_weight_zero_shows_a_voxel_but_says_nothing_of_it():
+def test_a_patch_of_weight_zero_shows_a_voxel_but_says_nothing_of_it(a_map):
     semantic_map = a_map()
     observe(semantic_map, [[1, 0, 0]], [0.0])
     assert (semantic_map.voxel_count, semantic_map.dense_voxel_count) == (1, 0)
@@ -64,7 +74,7 @@ def test_a_patch_of_weight_zero_shows_a_voxel_but_says_nothing_of_it():
     np.testing.assert_allclose(mean, [0, 1, 0], atol=1e-7)
 
 
-def test_a_voxel_shows_the_mean_colour_of_the_newest_frame_that_hit_it():
+def test_a_voxel_shows_the_mean_colour_of_the_newest_frame_that_hit_it(a_map):
     semantic_map = a_map()
     for colors in ([[10, 20, 30]], [[0, 100, 200], [100, 200, 0]]):
         semantic_map.integrate_dense(
@@ -77,7 +87,7 @@ def test_a_voxel_shows_the_mean_colour_of_the_newest_frame_that_hit_it():
     assert semantic_map.voxels().colors.tolist() == [[50, 150, 100]]
 
 
-def test_a_voxel_that_left_the_window_starts_anew_and_its_storage_is_reused():
+def test_a_voxel_that_left_the_window_starts_anew_and_its_storage_is_reused(a_map):
     semantic_map = a_map(radius_m=0.5)
     observe(semantic_map, [[1, 0, 0]], [1.0])
     allocated: set[int] = set()
@@ -107,9 +117,9 @@ def assert_same_dense(first: SemanticMap, second: SemanticMap, atol: float) -> N
     np.testing.assert_array_equal(sorted(a), sorted(b))
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.lists(st.integers(0, 60), max_size=6))
-def test_it_is_the_same_whether_points_arrive_in_one_frame_or_in_many(seed: int, count: int, cuts: list[int]):
+def test_it_is_the_same_whether_points_arrive_in_one_frame_or_in_many(a_map, seed: int, count: int, cuts: list[int]):
     frame = random_frame(seed, count)
     whole, parts = a_map(4), a_map(4)
     frame.apply(whole)
@@ -122,9 +132,9 @@ def test_it_is_the_same_whether_points_arrive_in_one_frame_or_in_many(seed: int,
     assert_same_dense(whole, parts, atol=1e-5)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60))
-def test_the_order_of_points_and_patches_does_not_matter(seed: int, count: int):
+def test_the_order_of_points_and_patches_does_not_matter(a_map, seed: int, count: int):
     frame = random_frame(seed, count)
     rng = np.random.default_rng(seed + 1)
     points, patches = rng.permutation(count), rng.permutation(len(frame.weights))
@@ -142,7 +152,7 @@ def test_the_order_of_points_and_patches_does_not_matter(seed: int, count: int):
     assert_same_dense(straight, mixed, atol=1e-5)
 
 
-def test_a_mean_of_many_frames_stays_exact():
+def test_a_mean_of_many_frames_stays_exact(a_map):
     """Tens of thousands of observations of one voxel: no drift away from the mean of all of them."""
     rng = np.random.default_rng(3)
     semantic_map = a_map(4)
@@ -157,10 +167,11 @@ def test_a_mean_of_many_frames_stays_exact():
     np.testing.assert_allclose(mean, total / weight, atol=2e-5)
 
 
-def test_half_precision_stores_halves_and_stays_within_their_rounding():
-    exact, half = a_map(4), a_map(4, "float16")
+@pytest.mark.parametrize(("dtype", "stored"), [("float16", np.float16), ("int8", np.int8)])
+def test_low_precision_is_stored_as_such_and_stays_within_its_rounding(a_map, dtype: str, stored: type):
+    exact, low = a_map(4), a_map(4, dtype)
     for seed in range(12):
-        for semantic_map in (exact, half):
+        for semantic_map in (exact, low):
             random_frame(seed, 150, weightless=False).apply(semantic_map)
-    assert half.export_state()["dense_embedding"].dtype == np.float16
-    assert_same_dense(exact, half, atol=12 * 2.0**-11)
+    assert low.export_state()["dense_embedding"].dtype == stored
+    assert_same_dense(exact, low, atol=12 * ROUNDING[dtype])

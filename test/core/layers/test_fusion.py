@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.snapshots import SimilarityBlock
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)
 FAR = np.array([1e3, 0.0, 0.0])
 
 
-def a_map(variance_ratio: float = 1.0, window_radius_m: float = 0.0) -> SemanticMap:
-    return SemanticMap(3, MapConfig(voxel_size_m=SIZE_M), variance_ratio, window_radius_m)
+@pytest.fixture(params=BACKENDS, ids=BACKEND_IDS)
+def a_map(request) -> Callable[..., SemanticMap]:
+    """Makes a map on each of the backends."""
+    backend, device = request.param
+
+    def make(variance_ratio: float = 1.0, window_radius_m: float = 0.0, max_hypotheses: int = 3) -> SemanticMap:
+        config = MapConfig(voxel_size_m=SIZE_M, max_hypotheses=max_hypotheses, backend=backend, device=device)
+        return SemanticMap(3, config, variance_ratio, window_radius_m)
+
+    return make
 
 
 def points(numbers) -> np.ndarray:
@@ -41,9 +53,14 @@ def fused(semantic_map: SemanticMap, instance_id: int = 0) -> tuple[np.ndarray, 
 
 def cosines(semantic_map: SemanticMap, layer: str) -> dict[int, np.ndarray]:
     """Per voxel the cosines with x, y and z: the direction of its embedding."""
-    answer = semantic_map.similarity(layer, np.eye(3, dtype=np.float32))
-    numbers = np.floor(answer.voxels.centers_m[answer.slots, 0] / SIZE_M).astype(int)
-    return dict(zip(numbers.tolist(), answer.cosines, strict=True))
+    found: dict[int, np.ndarray] = {}
+
+    def collect(block: SimilarityBlock) -> None:
+        numbers = np.floor(block.centers_m[:, 0] / SIZE_M).astype(int)
+        found.update(zip(numbers.tolist(), block.cosines, strict=True))
+
+    semantic_map.visit_similarity(layer, np.eye(3, dtype=np.float32), collect)
+    return found
 
 
 def direction(vector) -> np.ndarray:
@@ -51,7 +68,7 @@ def direction(vector) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ratio", [0.25, 1.0, 5.0])
-def test_an_instance_is_the_mean_of_its_voxels_by_precision(ratio: float):
+def test_an_instance_is_the_mean_of_its_voxels_by_precision(a_map, ratio: float):
     semantic_map = a_map(ratio)
     see(semantic_map, [0, 0, 0], Y)
     see(semantic_map, [1], Z, weight=0.5)
@@ -66,7 +83,7 @@ def test_an_instance_is_the_mean_of_its_voxels_by_precision(ratio: float):
     assert (report.instances, report.updated, report.voxels) == (1, 1, 4)
 
 
-def test_every_hypothesis_of_a_voxel_is_fused_with_its_own_count():
+def test_every_hypothesis_of_a_voxel_is_fused_with_its_own_count(a_map):
     semantic_map = a_map()
     see(semantic_map, [0, 0], Z)
     propose(semantic_map, [0, 0, 0], X)
@@ -77,7 +94,7 @@ def test_every_hypothesis_of_a_voxel_is_fused_with_its_own_count():
 
 
 @pytest.mark.parametrize("ratio", [0.25, 1.0, 5.0])
-def test_a_dense_voxel_is_fused_with_its_top_hypothesis_alone(ratio: float):
+def test_a_dense_voxel_is_fused_with_its_top_hypothesis_alone(a_map, ratio: float):
     semantic_map = a_map(ratio)
     see(semantic_map, [0, 0], Z)
     see(semantic_map, [3], Z)
@@ -90,7 +107,7 @@ def test_a_dense_voxel_is_fused_with_its_top_hypothesis_alone(ratio: float):
     assert len(got) == 12
 
 
-def test_without_dense_evidence_an_instance_keeps_its_own_embedding():
+def test_without_dense_evidence_an_instance_keeps_its_own_embedding(a_map):
     semantic_map = a_map(5.0)
     propose(semantic_map, [0, 1], X + Y)
     semantic_map.fuse()
@@ -99,7 +116,7 @@ def test_without_dense_evidence_an_instance_keeps_its_own_embedding():
     assert evidence == pytest.approx(10.0)
 
 
-def test_without_a_window_a_query_sees_the_map_as_it_is_and_leaves_it_so():
+def test_without_a_window_a_query_sees_the_map_as_it_is_and_leaves_it_so(a_map):
     semantic_map = a_map()
     propose(semantic_map, [0], X)
     semantic_map.fuse()
@@ -111,7 +128,7 @@ def test_without_a_window_a_query_sees_the_map_as_it_is_and_leaves_it_so():
     np.testing.assert_allclose(fused(semantic_map)[0], X, atol=1e-6)
 
 
-def test_with_a_window_a_query_sees_what_fusion_stored():
+def test_with_a_window_a_query_sees_what_fusion_stored(a_map):
     semantic_map = a_map(window_radius_m=2.0)
     propose(semantic_map, [0], X)
     see(semantic_map, [0, 0, 0], Y)
@@ -123,7 +140,7 @@ def test_with_a_window_a_query_sees_what_fusion_stored():
     np.testing.assert_allclose(cosines(semantic_map, "fused_instances")[0], direction(X + 3 * Y), atol=1e-6)
 
 
-def test_with_a_window_only_more_evidence_replaces():
+def test_with_a_window_only_more_evidence_replaces(a_map):
     semantic_map = a_map(window_radius_m=2.0)
     see(semantic_map, [0, 0, 0], Y)
     propose(semantic_map, [0], X)
@@ -146,8 +163,8 @@ def test_with_a_window_only_more_evidence_replaces():
     assert evidence == 4.25
 
 
-def test_without_a_window_less_evidence_replaces_too():
-    semantic_map = SemanticMap(3, MapConfig(voxel_size_m=SIZE_M, max_hypotheses=1), 1.0)
+def test_without_a_window_less_evidence_replaces_too(a_map):
+    semantic_map = a_map(max_hypotheses=1)
     see(semantic_map, [0, 0, 0, 1], Y)
     propose(semantic_map, [0, 1], X)
     semantic_map.fuse()
@@ -159,7 +176,7 @@ def test_without_a_window_less_evidence_replaces_too():
     np.testing.assert_allclose(embedding, (X + Y) / 2, atol=1e-6)
 
 
-def test_an_instance_born_outside_the_window_is_fused_from_its_counts():
+def test_an_instance_born_outside_the_window_is_fused_from_its_counts(a_map):
     semantic_map = a_map(2.0, window_radius_m=2.0)
     propose(semantic_map, [0, 1], X)
     semantic_map.prune_window(FAR)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.semantic_map import SemanticMap
@@ -16,8 +17,22 @@ SIZE_M = 0.5
 X, Y, Z = np.eye(3)
 
 
-def a_map(max_hypotheses: int = 3, iou_threshold: float = 0.2) -> SemanticMap:
-    return SemanticMap(3, MapConfig(voxel_size_m=SIZE_M, max_hypotheses=max_hypotheses, iou_threshold=iou_threshold), 1.0)
+@pytest.fixture(scope="module", params=BACKENDS, ids=BACKEND_IDS)
+def a_map(request) -> Callable[..., SemanticMap]:
+    """Makes a map on each of the backends."""
+    backend, device = request.param
+
+    def make(max_hypotheses: int = 3, iou_threshold: float = 0.2) -> SemanticMap:
+        config = MapConfig(
+            voxel_size_m=SIZE_M,
+            max_hypotheses=max_hypotheses,
+            iou_threshold=iou_threshold,
+            backend=backend,
+            device=device,
+        )
+        return SemanticMap(3, config, 1.0)
+
+    return make
 
 
 def propose(semantic_map: SemanticMap, *masks: Iterable[int], embeddings=None) -> list[int]:
@@ -48,7 +63,7 @@ def alive(semantic_map: SemanticMap) -> list[int]:
     return semantic_map.instances().ids.tolist()
 
 
-def test_a_proposal_that_meets_nothing_is_a_new_instance():
+def test_a_proposal_that_meets_nothing_is_a_new_instance(a_map):
     semantic_map = a_map()
     assert propose(semantic_map, [0, 0, 1], [5], embeddings=[2 * X, 3 * Y]) == [0, 1]
     assert hypotheses(semantic_map) == {0: {0: 2}, 1: {0: 1}, 5: {1: 1}}
@@ -56,7 +71,7 @@ def test_a_proposal_that_meets_nothing_is_a_new_instance():
     np.testing.assert_allclose(embedding(semantic_map, 0), X, atol=1e-7)
 
 
-def test_a_match_adds_its_points_to_counts_weight_and_mean():
+def test_a_match_adds_its_points_to_counts_weight_and_mean(a_map):
     semantic_map = a_map()
     propose(semantic_map, [0, 1, 2], embeddings=[X])
     assert propose(semantic_map, [1, 2, 2, 2, 3], embeddings=[7 * Y]) == [0]
@@ -80,19 +95,19 @@ def test_a_match_adds_its_points_to_counts_weight_and_mean():
         (0.0, 400, 1, True),
     ],
 )
-def test_the_overlap_must_exceed_the_threshold(threshold: float, old: int, new: int, matches: bool):
+def test_the_overlap_must_exceed_the_threshold(a_map, threshold: float, old: int, new: int, matches: bool):
     semantic_map = a_map(iou_threshold=threshold)
     propose(semantic_map, range(old))
     assert propose(semantic_map, range(new)) == [0 if matches else 1]
 
 
-def test_with_no_threshold_a_proposal_must_still_meet_the_instance():
+def test_with_no_threshold_a_proposal_must_still_meet_the_instance(a_map):
     semantic_map = a_map(iou_threshold=0.0)
     propose(semantic_map, [0])
     assert propose(semantic_map, [1]) == [1]
 
 
-def test_the_union_counts_every_voxel_that_holds_the_instance_as_a_hypothesis():
+def test_the_union_counts_every_voxel_that_holds_the_instance_as_a_hypothesis(a_map):
     semantic_map = a_map()
     propose(semantic_map, range(3))
     # Another instance of more observations tops voxels 0..2, but they go on belonging to instance 0 as well.
@@ -102,7 +117,7 @@ def test_the_union_counts_every_voxel_that_holds_the_instance_as_a_hypothesis():
     assert propose(semantic_map, [0, 1, 2]) == [0]
 
 
-def test_the_greatest_overlap_wins_and_of_equal_ones_the_lowest_id():
+def test_the_greatest_overlap_wins_and_of_equal_ones_the_lowest_id(a_map):
     semantic_map = a_map()
     propose(semantic_map, [0, 1], [4, 5, 6], [8, 9])
     assert propose(semantic_map, [1, 4, 5]) == [1]
@@ -115,13 +130,13 @@ def test_the_greatest_overlap_wins_and_of_equal_ones_the_lowest_id():
     assert propose(semantic_map, [0, 1, 10]) == [0]
 
 
-def test_proposals_of_a_frame_meet_the_map_as_the_one_before_left_it():
+def test_proposals_of_a_frame_meet_the_map_as_the_one_before_left_it(a_map):
     semantic_map = a_map()
     assert propose(semantic_map, [0, 1, 2], [1, 2, 3], [3, 4], embeddings=[X, Y, Z]) == [0, 0, 1]
     assert hypotheses(semantic_map)[3] == {0: 1, 1: 1}
 
 
-def test_points_of_a_proposal_need_not_be_together():
+def test_points_of_a_proposal_need_not_be_together(a_map):
     semantic_map = a_map()
     points = np.array([[0.1, 0.1, 0.1], [5.1, 0.1, 0.1], [0.1, 0.1, 0.1], [5.1, 0.1, 0.1], [0.2, 0.1, 0.1]])
     ids = semantic_map.integrate_proposals(points, np.array([2, 0, 2, 0, 2]), np.stack([X, Y, Z]))
@@ -129,7 +144,7 @@ def test_points_of_a_proposal_need_not_be_together():
     assert hypotheses(semantic_map) == {10: {0: 2}, 0: {1: 3}}
 
 
-def test_a_proposal_without_points_gets_no_id_and_uses_none_up():
+def test_a_proposal_without_points_gets_no_id_and_uses_none_up(a_map):
     semantic_map = a_map()
     assert propose(semantic_map, [], [0], [], [9]) == [-1, 0, -1, 1]
 
@@ -141,7 +156,7 @@ def crowd(semantic_map: SemanticMap, counts: list[int]) -> None:
         assert propose(semantic_map, [0] * count + list(own)) == [number]
 
 
-def test_a_newcomer_takes_the_place_of_the_lowest_count():
+def test_a_newcomer_takes_the_place_of_the_lowest_count(a_map):
     semantic_map = a_map()
     crowd(semantic_map, [4, 2, 3])
     assert propose(semantic_map, [0]) == [3]  # Its own count is the lowest of all: it is the others that compete.
@@ -150,21 +165,21 @@ def test_a_newcomer_takes_the_place_of_the_lowest_count():
     assert semantic_map.instances().weights.tolist() == [24, 22, 23, 1]
 
 
-def test_of_equal_lowest_counts_the_oldest_goes():
+def test_of_equal_lowest_counts_the_oldest_goes(a_map):
     semantic_map = a_map()
     crowd(semantic_map, [5, 2, 2])
     propose(semantic_map, [0] * 9)
     assert hypotheses(semantic_map)[0] == {0: 5, 2: 2, 3: 9}
 
 
-def test_a_match_that_already_holds_the_voxel_drops_nobody():
+def test_a_match_that_already_holds_the_voxel_drops_nobody(a_map):
     semantic_map = a_map()
     crowd(semantic_map, [1, 2, 3])
     assert propose(semantic_map, [0, *range(100, 120)]) == [0]
     assert hypotheses(semantic_map)[0] == {0: 2, 1: 2, 2: 3}
 
 
-def test_a_matched_instance_enters_a_full_voxel_of_others():
+def test_a_matched_instance_enters_a_full_voxel_of_others(a_map):
     semantic_map = a_map(max_hypotheses=2)
     crowd(semantic_map, [3, 2])
     assert propose(semantic_map, range(300, 320)) == [2]
@@ -172,7 +187,7 @@ def test_a_matched_instance_enters_a_full_voxel_of_others():
     assert hypotheses(semantic_map)[0] == {0: 3, 2: 1}
 
 
-def test_an_instance_without_voxels_is_deleted_and_its_id_stays_unused():
+def test_an_instance_without_voxels_is_deleted_and_its_id_stays_unused(a_map):
     semantic_map = a_map(max_hypotheses=1)
     assert propose(semantic_map, [0]) == [0]
     assert propose(semantic_map, range(10)) == [1]
@@ -183,7 +198,7 @@ def test_an_instance_without_voxels_is_deleted_and_its_id_stays_unused():
     assert all(0 not in held for held in hypotheses(semantic_map).values())
 
 
-def test_a_later_proposal_may_displace_an_earlier_one_of_its_frame():
+def test_a_later_proposal_may_displace_an_earlier_one_of_its_frame(a_map):
     semantic_map = a_map(max_hypotheses=1)
     assert propose(semantic_map, [0], range(10)) == [0, 1]
     assert alive(semantic_map) == [1]
@@ -193,7 +208,7 @@ def test_a_later_proposal_may_displace_an_earlier_one_of_its_frame():
 
 
 @pytest.mark.parametrize("counts", [[2, 2, 1], [1, 3, 3]])
-def test_of_equal_highest_counts_the_lowest_id_is_on_top(counts: list[int]):
+def test_of_equal_highest_counts_the_lowest_id_is_on_top(a_map, counts: list[int]):
     semantic_map = a_map()
     crowd(semantic_map, counts)
     voxels = semantic_map.voxels()
@@ -202,7 +217,7 @@ def test_of_equal_highest_counts_the_lowest_id_is_on_top(counts: list[int]):
     assert voxels.top_count[slot] == max(counts)
 
 
-def test_the_oldest_of_a_tie_goes_whatever_order_they_came_to_the_voxel():
+def test_the_oldest_of_a_tie_goes_whatever_order_they_came_to_the_voxel(a_map):
     semantic_map = a_map(max_hypotheses=2)
     own = [range(100 * each, 100 * each + 20) for each in range(3)]
     assert propose(semantic_map, *own) == [0, 1, 2]
@@ -212,12 +227,14 @@ def test_the_oldest_of_a_tie_goes_whatever_order_they_came_to_the_voxel():
     assert hypotheses(semantic_map)[900] == {1: 1, 2: 1}
 
 
-@settings(max_examples=30)
+@settings(max_examples=15)
 @given(
     st.lists(st.tuples(st.integers(0, 5), st.integers(2, 6)), min_size=1, max_size=6, unique_by=lambda pair: pair[0]),
     st.integers(1, 5),
 )
-def test_it_is_the_same_whether_a_proposal_arrives_in_one_frame_or_in_many(voxels: list[tuple[int, int]], frames: int):
+def test_it_is_the_same_whether_a_proposal_arrives_in_one_frame_or_in_many(
+    a_map, voxels: list[tuple[int, int]], frames: int
+):
     """The points of one object, all its voxels hit by each share, as one proposal or as several of one embedding."""
     whole, parts = a_map(), a_map()
     share = [number for number, count in voxels for _ in range(count)]

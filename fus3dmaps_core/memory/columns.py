@@ -26,13 +26,21 @@ class Column:
         grown[:capacity] = self._data
         self._data = grown
 
+    # Not by torch's advanced indexing: it shares even small work among threads, and on a machine whose cores are all busy
+    # each such call waits a time slice for them.
+
     def __getitem__(self, rows: Tensor | slice) -> Tensor:
-        """Values of the rows."""
-        return self._data[rows]
+        """Values of the rows, a copy for (n,) int64 and no copy for a slice."""
+        return self._data[rows] if isinstance(rows, slice) else self._data.index_select(0, rows)
 
     def __setitem__(self, rows: Tensor | slice, values: Tensor | int | float) -> None:
         """Write the rows, which must be reserved."""
-        self._data[rows] = values
+        if isinstance(rows, slice):
+            self._data[rows] = values
+        elif isinstance(values, Tensor):
+            self._data.index_copy_(0, rows, values)
+        else:
+            self._data.index_fill_(0, rows, values)
 
     @property
     def nbytes(self) -> int:

@@ -1,0 +1,286 @@
+"""What the map asks of its inner loops. Tensors live on one device; no call changes more than it says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from torch import Tensor
+
+from fus3dmaps_core.memory.rows import RowPool
+
+EMPTY, DELETED = -1, -2
+"""Contents of cells of a hash table without a key: probing ends at an empty one and goes on past a deleted one."""
+
+
+MAX_COUNT = 2**31 - 1
+"""Counts of hypotheses stay here when they would grow beyond."""
+
+
+@dataclass(frozen=True)
+class HashTable:
+    """An open-addressing table with linear probing.
+
+    Attributes:
+        keys: (c,) int64, c being a power of two: keys, EMPTY or DELETED.
+        slots: (c,) int32 slot of each key.
+    """
+
+    keys: Tensor
+    slots: Tensor
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """A sparse matrix of counts, by rows: what in which group, how often.
+
+    Attributes:
+        offsets: (groups + 1,) int64, where each group begins in the other two, and where the last one ends.
+        partners: (n,) int64.
+        counts: (n,) int64, positive.
+    """
+
+    offsets: Tensor
+    partners: Tensor
+    counts: Tensor
+
+
+@dataclass(frozen=True)
+class Hypotheses:
+    """The columns of the instance layer that association works on.
+
+    Attributes:
+        held_row: (slots, K) int32 rows of the instances that a voxel holds, -1 where empty.
+        held_count: (slots, K) int32 their counts.
+        id_of_row: (rows,) int64 ids, -1 for a row without an instance.
+        voxels_of_row: (rows,) int32 |V_id|.
+        observations_of_row: (rows,) int64 sum of an instance's counts.
+        changed: (rows,) bool, set where an instance's voxels or counts change.
+    """
+
+    held_row: Tensor
+    held_count: Tensor
+    id_of_row: Tensor
+    voxels_of_row: Tensor
+    observations_of_row: Tensor
+    changed: Tensor
+
+
+@dataclass(frozen=True)
+class Extents:
+    """What instances occupy, by their row: sums over the voxels whose top hypothesis they are.
+
+    Attributes:
+        voxels: (rows,) int64, how many these are.
+        counts: (rows,) int64, sum of their top counts.
+        sums: (rows, 3) int64, sum of top count times voxel coordinate.
+        low: (rows, 3) int64, smallest voxel coordinates.
+        high: (rows, 3) int64, largest voxel coordinates.
+    """
+
+    voxels: Tensor
+    counts: Tensor
+    sums: Tensor
+    low: Tensor
+    high: Tensor
+
+
+@dataclass(frozen=True)
+class SlotBlock:
+    """Consecutive slots.
+
+    Attributes:
+        first: Number of the first slot.
+        keys: (n,) int64 keys, negative where a slot has no voxel.
+        dense_rows: (n,) int32 dense rows, -1 for none.
+        voxel_size_m: Edge of a voxel, metres.
+    """
+
+    first: int
+    keys: Tensor
+    dense_rows: Tensor
+    voxel_size_m: float
+
+
+@dataclass(frozen=True)
+class VoxelBlock:
+    """Some voxels of a block of slots.
+
+    Attributes:
+        centers_m: (n, 3) float32.
+        dense_rows: (n,) int64, -1 for none.
+        top_rows: (n,) int64 instance row of the top hypothesis, -1 for none.
+        top_counts: (n,) int64 its count.
+    """
+
+    centers_m: Tensor
+    dense_rows: Tensor
+    top_rows: Tensor
+    top_counts: Tensor
+
+
+@dataclass(frozen=True)
+class Association:
+    """What became of a keyframe's proposals.
+
+    Attributes:
+        rows: (m,) int64 row of each proposal's instance, -1 for a proposal without points.
+        ids: (m,) int64 its id.
+        created: How many instances were made.
+        dead: Rows of the instances that lost their last voxel, int64.
+    """
+
+    rows: Tensor
+    ids: Tensor
+    created: int
+    dead: Tensor
+
+
+class Kernels(Protocol):
+    """The inner loops of the map."""
+
+    def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
+        """Packed key of the voxel of each point (n, 3): floor(p / size) per axis.
+
+        Returns:
+            (n,) int64 keys, and the largest coordinate's size: keys mean nothing if that is beyond MAX_COORDINATE, or NaN
+            because a point is not finite.
+        """
+        ...
+
+    def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
+        """Rows (n, d) of any length scaled to unit length.
+
+        Returns:
+            (n, d) float32 and 0; or nothing of meaning and 1, a value is not finite, or 2, a row has length 0.
+        """
+        ...
+
+    def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Distinct keys in an order that the input alone decides, the place of each input among them, and counts: int64."""
+        ...
+
+    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> Pairs:
+        """Count equal (first, second) pairs, (n,) int64 in [0, groups) and [0, partners), grouped by first."""
+        ...
+
+    def find(self, table: HashTable, keys: Tensor) -> Tensor:
+        """Slots of the keys, -1 where the table lacks one: (n,) int64."""
+        ...
+
+    def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
+        """Put distinct keys that the table lacks into it, which must have room."""
+        ...
+
+    def bury(self, table: HashTable, keys: Tensor) -> None:
+        """Mark distinct keys that the table has as deleted."""
+        ...
+
+    def merge_means(
+        self,
+        pool: RowPool,
+        rows: Tensor,
+        old: Tensor,
+        new: Tensor,
+        seeds: Tensor,
+        groups: Pairs,
+        amounts: Tensor,
+        embeddings: Tensor,
+    ) -> None:
+        """Write rows[i] <- (old[i] rows[i] + sum over group i of amounts embeddings[partners]) / new[i].
+
+        Args:
+            pool: The rows.
+            rows: (n,) int64 distinct rows.
+            old: (n,) float32 weights; 0 for rows whose content is undefined.
+            new: (n,) float32 weights, positive.
+            seeds: (n,) int64 seeds of rounding.
+            groups: n groups.
+            amounts: One float32 for each of the groups' partners.
+            embeddings: (p, d) float32.
+        """
+        ...
+
+    def integrate(
+        self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
+    ) -> Association:
+        """Associate proposals in order and count them, each against the map as the previous one left it.
+
+        Args:
+            hypotheses: Changed, but for rows' embeddings and weights.
+            proposals: m groups of slots and N_i.
+            spare_rows: (m,) int64 rows for new instances, taken from the front.
+            next_id: Id of the next new instance.
+            iou_threshold: An IoU must be larger than this to match.
+        """
+        ...
+
+    def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
+        """Per slot the row with the highest count (ties: the lowest id; -1 without one) and that count: (n,) int64."""
+        ...
+
+    def survey(
+        self, block: SlotBlock, hypotheses: Hypotheses, extents: Extents, with_dense: bool, with_instance: bool
+    ) -> VoxelBlock:
+        """Look at a block of slots once: add its voxels to what instances occupy, and pick those that have a layer.
+
+        Args:
+            block: The slots.
+            hypotheses: Of all slots.
+            extents: Changed, by every voxel of the block that has a hypothesis.
+            with_dense: Pick voxels that have a dense embedding.
+            with_instance: Pick voxels that have a hypothesis.
+
+        Returns:
+            The voxels picked, in the order of slots.
+        """
+        ...
+
+    def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
+        """Places, int64 ascending, of keys whose voxel's centre is farther than a radius from a point (3,) float64."""
+        ...
+
+    def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
+        """Centres of voxels: (n, 3) float32, metres."""
+        ...
+
+    def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
+        """Cosines of the rows with unit vectors (p, d): (n, p) float32."""
+        ...
+
+    def fused_cosines(
+        self,
+        pool: RowPool,
+        rows: Tensor,
+        weights: Tensor,
+        own_pool: RowPool,
+        own_rows: Tensor,
+        own_weights: Tensor,
+        texts: Tensor,
+    ) -> Tensor:
+        """Cosines of (weights rows + own_weights own_rows) with unit vectors (p, d): (n, p) float32; row -1 adds nothing."""
+        ...
+
+    def weighted_sums(
+        self,
+        pool: RowPool,
+        slot_of_row: Tensor,
+        weight_of_row: Tensor,
+        held_row: Tensor,
+        place_of_instance: Tensor,
+        places: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Sums over instances' voxels of w f and of w, in one pass over the rows.
+
+        Args:
+            pool: The rows.
+            slot_of_row: (rows,) int32 slot of each row, -1 for a free one.
+            weight_of_row: (rows,) float32 w.
+            held_row: (slots, K) int32 instances that each slot holds, -1 where empty.
+            place_of_instance: (instance rows,) int32, which sum an instance's voxels go to, -1 for none.
+            places: Number of sums.
+
+        Returns:
+            (places, d) float64 and (places,) float64. An instance's sums depend on its own voxels alone, bit for bit.
+        """
+        ...

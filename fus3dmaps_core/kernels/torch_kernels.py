@@ -1,0 +1,284 @@
+"""The inner loops in plain torch, for any device."""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor
+from torch.nn.functional import embedding_bag, normalize
+
+from fus3dmaps_core.kernels.keys import MAX_COORDINATE, home, pack, unpack
+from fus3dmaps_core.kernels.protocols import (
+    DELETED,
+    EMPTY,
+    MAX_COUNT,
+    Association,
+    Extents,
+    HashTable,
+    Hypotheses,
+    Pairs,
+    SlotBlock,
+    VoxelBlock,
+)
+from fus3dmaps_core.memory.rows import RowPool
+
+_COUNT_UNIT = 2**32  # Orders by count first, then by id, in one integer.
+_READ_ROWS = 2048  # Rows that are decoded at once, so that memory stays bounded.
+
+
+class TorchKernels:
+    """Kernels as tensor operations; only proposals, whose order matters, are taken one by one."""
+
+    def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
+        """As the protocol says."""
+        if not len(points_m):
+            return torch.zeros(0, dtype=torch.int64, device=points_m.device), 0.0
+        coordinates = torch.floor(points_m.to(torch.float64) / voxel_size_m)
+        largest = float(coordinates.abs().max())
+        return pack(coordinates.nan_to_num(0.0).clamp(-MAX_COORDINATE, MAX_COORDINATE)), largest
+
+    def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
+        """As the protocol says."""
+        wide = values.to(torch.float64)
+        if not bool(torch.isfinite(wide).all()):
+            return values, 1
+        largest = wide.abs().amax(dim=1, keepdim=True) if len(wide) else wide[:, :1]
+        if bool((largest == 0).any()):
+            return values, 2
+        # Scaled first, so that squares neither overflow nor vanish whatever the row's length.
+        return normalize(wide / largest, dim=1).to(torch.float32), 0
+
+    def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """As the protocol says: in ascending order."""
+        unique, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
+        return unique, inverse, counts
+
+    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> Pairs:
+        """As the protocol says: partners of a group in ascending order."""
+        pairs, counts = torch.unique(first * partners + second, return_counts=True)
+        offsets = torch.zeros(groups + 1, dtype=torch.int64, device=first.device)
+        if len(pairs):
+            offsets[1:] = torch.cumsum(torch.bincount(pairs // partners, minlength=groups), 0)
+            pairs = pairs % partners
+        return Pairs(offsets, pairs, counts)
+
+    def find(self, table: HashTable, keys: Tensor) -> Tensor:
+        """As the protocol says."""
+        slots = torch.full_like(keys, -1)
+        rows = torch.arange(len(keys), device=keys.device)
+        cells = home(keys, len(table.keys))
+        while len(rows):
+            found = table.keys[cells]
+            hit = found == keys[rows]
+            slots[rows[hit]] = table.slots[cells[hit]].to(torch.int64)
+            onward = ~hit & (found != EMPTY)
+            rows, cells = rows[onward], (cells[onward] + 1) & (len(table.keys) - 1)
+        return slots
+
+    def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
+        """As the protocol says."""
+        cells = home(keys, len(table.keys))
+        while len(keys):
+            free = table.keys[cells] == EMPTY
+            # Several keys may claim one cell: one write survives, whose key reads back; the others probe on.
+            table.keys[cells[free]] = keys[free]
+            won = free & (table.keys[cells] == keys)
+            table.slots[cells[won]] = slots[won].to(torch.int32)
+            keys, slots, cells = keys[~won], slots[~won], (cells[~won] + 1) & (len(table.keys) - 1)
+
+    def bury(self, table: HashTable, keys: Tensor) -> None:
+        """As the protocol says."""
+        cells = home(keys, len(table.keys))
+        while len(keys):
+            hit = table.keys[cells] == keys
+            table.keys[cells[hit]] = DELETED
+            keys, cells = keys[~hit], (cells[~hit] + 1) & (len(table.keys) - 1)
+
+    def merge_means(
+        self,
+        pool: RowPool,
+        rows: Tensor,
+        old: Tensor,
+        new: Tensor,
+        seeds: Tensor,
+        groups: Pairs,
+        amounts: Tensor,
+        embeddings: Tensor,
+    ) -> None:
+        """As the protocol says."""
+        known = old > 0
+        means = torch.where(known[:, None], pool.read(rows), 0.0)
+        sums = embedding_bag(groups.partners, embeddings, groups.offsets[:-1], mode="sum", per_sample_weights=amounts)
+        scales = torch.where(known, pool.scales[rows], 0.0) if pool.dtype == torch.int8 else None
+        pool.write(rows, means.mul_((old / new)[:, None]).add_(sums.div_(new[:, None])), seeds, scales)
+
+    def integrate(
+        self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
+    ) -> Association:
+        """As the protocol says."""
+        matched, ids, dead, created = [], [], [], 0
+        ends = proposals.offsets.tolist()
+        for start, end in itertools.pairwise(ends):
+            if start == end:
+                matched.append(-1)
+                ids.append(-1)
+                continue
+            slots, counts = proposals.partners[start:end], proposals.counts[start:end]
+            held = hypotheses.held_row[slots].to(torch.int64)
+            row = _best_match(hypotheses, held, len(slots), iou_threshold)
+            if row is None:
+                row = int(spare_rows[created])
+                hypotheses.id_of_row[row] = next_id + created
+                created += 1
+            matched.append(row)
+            ids.append(int(hypotheses.id_of_row[row]))
+            dead.append(_count(hypotheses, slots, counts, held, row))
+        device = proposals.offsets.device
+        died = torch.cat(dead) if dead else torch.zeros(0, dtype=torch.int64, device=device)
+        rows, given = (torch.tensor(each, dtype=torch.int64, device=device) for each in (matched, ids))
+        return Association(rows, given, created, died)
+
+    def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
+        """As the protocol says."""
+        rows = hypotheses.held_row[slots].to(torch.int64)
+        counts = hypotheses.held_count[slots].to(torch.int64)
+        if not len(hypotheses.id_of_row):
+            return rows[:, 0], counts[:, 0]
+        column = torch.argmax(counts * _COUNT_UNIT - hypotheses.id_of_row[rows.clamp(min=0)], dim=1, keepdim=True)
+        return rows.gather(1, column).squeeze(1), counts.gather(1, column).squeeze(1)
+
+    def survey(
+        self, block: SlotBlock, hypotheses: Hypotheses, extents: Extents, with_dense: bool, with_instance: bool
+    ) -> VoxelBlock:
+        """As the protocol says."""
+        slots = torch.arange(block.first, block.first + len(block.keys), device=block.keys.device)
+        top_rows, top_counts = self.top_hypotheses(hypotheses, slots)
+        owned = top_rows >= 0
+        rows, counts, coordinates = top_rows[owned], top_counts[owned], unpack(block.keys[owned])
+        extents.voxels.index_add_(0, rows, torch.ones_like(rows))
+        extents.counts.index_add_(0, rows, counts)
+        extents.sums.index_add_(0, rows, counts[:, None] * coordinates)
+        by_axis = rows[:, None].expand(-1, 3)
+        extents.low.scatter_reduce_(0, by_axis, coordinates, "amin")
+        extents.high.scatter_reduce_(0, by_axis, coordinates, "amax")
+        dense_rows = block.dense_rows.to(torch.int64)
+        picked = ((dense_rows >= 0) & with_dense) | (owned & with_instance)
+        centers_m = self.centers(block.keys[picked], block.voxel_size_m)
+        return VoxelBlock(centers_m, dense_rows[picked], top_rows[picked], top_counts[picked])
+
+    def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
+        """As the protocol says."""
+        offsets = (unpack(keys).to(torch.float64) + 0.5) * voxel_size_m - point_m
+        return torch.nonzero(torch.linalg.vector_norm(offsets, dim=1) > radius_m).squeeze(1)
+
+    def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
+        """As the protocol says."""
+        return ((unpack(keys).to(torch.float64) + 0.5) * voxel_size_m).to(torch.float32)
+
+    def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
+        """As the protocol says."""
+        found = texts.new_empty((len(rows), len(texts)))
+        for start in range(0, len(rows), _READ_ROWS):
+            part = slice(start, start + _READ_ROWS)
+            found[part] = normalize(pool.read(rows[part]), dim=1) @ texts.T
+        return found
+
+    def fused_cosines(
+        self,
+        pool: RowPool,
+        rows: Tensor,
+        weights: Tensor,
+        own_pool: RowPool,
+        own_rows: Tensor,
+        own_weights: Tensor,
+        texts: Tensor,
+    ) -> Tensor:
+        """As the protocol says."""
+        found = texts.new_empty((len(rows), len(texts)))
+        for start in range(0, len(rows), _READ_ROWS):
+            part = slice(start, start + _READ_ROWS)
+            fused = texts.new_zeros((len(rows[part]), texts.shape[1]))
+            dense_rows, dense_weights = rows[part], weights[part]
+            instance_rows, instance_weights = own_rows[part], own_weights[part]
+            total = dense_weights + instance_weights
+            shares = torch.where(instance_rows < 0, 1.0, dense_weights / total)
+            rests = torch.where(dense_rows < 0, 1.0, instance_weights / total)
+            for source, where, share in ((pool, dense_rows, shares), (own_pool, instance_rows, rests)):
+                used = where >= 0
+                fused[used] += source.read(where[used]) * share[used, None]
+            found[part] = normalize(fused, dim=1) @ texts.T
+        return found
+
+    def weighted_sums(
+        self,
+        pool: RowPool,
+        slot_of_row: Tensor,
+        weight_of_row: Tensor,
+        held_row: Tensor,
+        place_of_instance: Tensor,
+        places: int,
+    ) -> tuple[Tensor, Tensor]:
+        """As the protocol says."""
+        sums = torch.zeros((places, pool.dimension), dtype=torch.float64, device=slot_of_row.device)
+        totals = torch.zeros(places, dtype=torch.float64, device=slot_of_row.device)
+        for first in range(0, len(slot_of_row), pool.block_rows):
+            slots = slot_of_row[first : first + pool.block_rows].to(torch.int64)
+            held = torch.where((slots >= 0)[:, None], held_row[slots.clamp(min=0)], -1).to(torch.int64)
+            place = torch.where(held >= 0, place_of_instance[held.clamp(min=0)], -1)
+            row, column = torch.nonzero(place >= 0, as_tuple=True)
+            if not len(row):
+                continue
+            owners, order = torch.sort(place[row, column].to(torch.int64), stable=True)
+            touched, lengths = torch.unique_consecutive(owners, return_counts=True)
+            # Only the rows that someone asks for are decoded.
+            wanted, row = torch.unique(row[order], return_inverse=True)
+            weights = weight_of_row[first + wanted][row]
+            bags = torch.cumsum(lengths, 0) - lengths
+            means = pool.read(first + wanted)
+            sums[touched] += embedding_bag(row, means, bags, mode="sum", per_sample_weights=weights).to(torch.float64)
+            totals[touched] += torch.segment_reduce(weights.to(torch.float64), "sum", lengths=lengths)
+        return sums, totals
+
+
+def _best_match(hypotheses: Hypotheses, held: Tensor, size: int, iou_threshold: float) -> int | None:
+    """Row of the instance with the largest IoU above the threshold (ties: the lowest id) among those held."""
+    candidates, shared = torch.unique(held[held >= 0], return_counts=True)
+    if not len(candidates):
+        return None
+    # Correctly rounded float64 quotients: equal ratios compare equal, and 1/5 is not above 0.2.
+    union = size + hypotheses.voxels_of_row[candidates].to(torch.int64) - shared
+    iou = shared.to(torch.float64) / union.to(torch.float64)
+    best = float(iou.max())
+    if best <= iou_threshold:
+        return None
+    winners = candidates[iou == best]
+    return int(winners[hypotheses.id_of_row[winners].argmin()])
+
+
+def _count(hypotheses: Hypotheses, slots: Tensor, counts: Tensor, held: Tensor, row: int) -> Tensor:
+    """Add the counts to an instance's hypotheses, displacing the weakest one of a full voxel; returns rows that died."""
+    is_own = held == row
+    known = is_own.any(dim=1)
+    had = hypotheses.held_count[slots].to(torch.int64)
+    # Empty places first (by position), then the lowest count, then the oldest id.
+    places = torch.arange(held.shape[1], device=held.device) - held.shape[1]
+    preference = torch.where(held < 0, places, had * _COUNT_UNIT + hypotheses.id_of_row[held.clamp(min=0)])
+    column = torch.where(known, is_own.to(torch.int64).argmax(dim=1), preference.argmin(dim=1))[:, None]
+    loser, lost_count = held.gather(1, column).squeeze(1), had.gather(1, column).squeeze(1)
+    before = torch.where(known, lost_count, 0)
+    after = (before + counts).clamp(max=MAX_COUNT)
+    hypotheses.held_row[slots] = held.scatter(1, column, row).to(torch.int32)
+    hypotheses.held_count[slots] = had.scatter(1, column, after[:, None]).to(torch.int32)
+    hypotheses.voxels_of_row[row] += int((~known).sum())
+    hypotheses.observations_of_row[row] += int((after - before).sum())
+    hypotheses.changed[row] = True
+    displaced = ~known & (loser >= 0)
+    losers, index, lost = torch.unique(loser[displaced], return_inverse=True, return_counts=True)
+    lost_observations = torch.zeros_like(losers).index_add_(0, index, lost_count[displaced])
+    hypotheses.voxels_of_row[losers] -= lost.to(torch.int32)
+    hypotheses.observations_of_row[losers] -= lost_observations
+    hypotheses.changed[losers] = True
+    dead: Tensor = losers[hypotheses.voxels_of_row[losers] == 0]
+    hypotheses.id_of_row[dead] = -1
+    return dead

@@ -1,0 +1,120 @@
+"""Fused embeddings of instances: what fusion stored, and with how much evidence."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from fus3dmaps_core.layers.fusion import FusionInputs, fuse_instances
+from fus3dmaps_core.layers.instances import InstanceLayer
+from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.rows import RowPool
+
+_FUSE_SUM_BYTES = 64 * 2**20
+_QUERY_SUM_BYTES = 4 * 2**20
+
+
+class FusedInstances:
+    """Fused embeddings and evidence under the rows of the instance layer.
+
+    What is stored changes with a fusion only. Without a window a query answers with fusion of the map as it is, so beside
+    what is stored there is a second set, which is kept up to date as far as someone has asked. Instances that have not
+    changed since are not computed again.
+    """
+
+    def __init__(self, dimension: int, windowed: bool, device: torch.device) -> None:
+        """Start empty."""
+        self._device = device
+        self._windowed = windowed
+        self._stored = RowPool(dimension, torch.float32, device)
+        self._evidence = Column(torch.float64, 0.0, device)
+        self._current = RowPool(dimension, torch.float32, device)
+        self._current_evidence = Column(torch.float64, 0.0, device)
+        self._unstored = Column(torch.bool, False, device)
+
+    def admit(self, rows: Tensor) -> None:
+        """Make room for new instances, whose rows may have been another's."""
+        if not len(rows):
+            return
+        highest = int(rows.max()) + 1
+        self._stored.allocate(max(0, highest - self._stored.high_water))
+        self._evidence.reserve(highest)
+        self._evidence[rows] = 0.0
+        if not self._windowed:
+            self._current.allocate(max(0, highest - self._current.high_water))
+            self._current_evidence.reserve(highest)
+            self._unstored.reserve(highest)
+            self._unstored[rows] = False
+
+    def fuse(self, inputs: FusionInputs, full: bool) -> tuple[int, int]:
+        """Bring what is stored up to date.
+
+        Without a window the fused embedding of every instance is that of the map as it is. With one, an instance gets its
+        new fused embedding only if the new evidence is greater than the stored one [sec: Sliding Window].
+
+        Args:
+            inputs: What is fused.
+            full: Compute every instance, not only those that have changed; the result is the same.
+
+        Returns:
+            For how many instances what is stored is now of this fusion, and how many were computed.
+        """
+        instances = inputs.instances
+        alive = instances.live()[1]
+        rows = alive.sort().values if full else instances.changed()
+        if not self._windowed:
+            self._refresh(inputs, rows, _FUSE_SUM_BYTES)
+            pending = torch.nonzero(self._unstored[: instances.pool.high_water]).squeeze(1)
+            for part in torch.split(pending, 1024):
+                self._stored.write(part, self._current.read(part))
+                self._evidence[part] = self._current_evidence[part]
+                self._unstored[part] = False
+            return len(alive), len(rows)
+        updated = 0
+        for part, fused, evidence in fuse_instances(inputs, rows, _FUSE_SUM_BYTES):
+            better = evidence > self._evidence[part]
+            self._stored.write(part[better], fused[better])
+            self._evidence[part[better]] = evidence[better]
+            updated += int(better.sum())
+        instances.settle(rows)
+        return updated, len(rows)
+
+    def restore(self, rows: Tensor, fused: Tensor, evidence: Tensor) -> None:
+        """Store fused embeddings (n, d) and evidence (n,), 0 for none."""
+        self.admit(rows)
+        self._stored.write(rows, fused)
+        self._evidence[rows] = evidence
+
+    def evidence(self, rows: Tensor) -> Tensor:
+        """Stored evidence e_id, 0 before the first fusion: (n,) float64."""
+        return self._evidence[rows]
+
+    def stored(self, rows: Tensor, instances: InstanceLayer) -> Tensor:
+        """Stored fused embeddings; f_id itself before an instance's first fusion: (n, d) float32."""
+        values = instances.pool.read(rows)
+        fused = self._evidence[rows] > 0
+        values[fused] = self._stored.read(rows[fused])
+        return values
+
+    def cosines(self, inputs: FusionInputs, rows: Tensor, texts: Tensor) -> Tensor:
+        """Cosines of the fused embeddings that a query sees with unit vectors (p, d): (n, p) float32."""
+        if not self._windowed:
+            self._refresh(inputs, inputs.instances.changed(), _QUERY_SUM_BYTES)
+            return inputs.kernels.cosines(self._current, rows, texts)
+        fused = self._evidence[rows] > 0
+        found = inputs.kernels.cosines(inputs.instances.pool, rows, texts)
+        found[fused] = inputs.kernels.cosines(self._stored, rows[fused], texts)
+        return found
+
+    @property
+    def nbytes(self) -> int:
+        """Allocated bytes."""
+        columns = (self._evidence, self._current_evidence, self._unstored)
+        return self._stored.nbytes + self._current.nbytes + sum(column.nbytes for column in columns)
+
+    def _refresh(self, inputs: FusionInputs, rows: Tensor, sum_bytes: int) -> None:
+        for part, fused, evidence in fuse_instances(inputs, rows, sum_bytes):
+            self._current.write(part, fused)
+            self._current_evidence[part] = evidence
+            self._unstored[part] = True
+        inputs.instances.settle(rows)

@@ -1,0 +1,136 @@
+"""The content of a map: its parts, and their state as plain arrays by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.kernels.keys import pack
+from fus3dmaps_core.kernels.protocols import Kernels
+from fus3dmaps_core.layers.dense import DenseLayer
+from fus3dmaps_core.layers.fused_instances import FusedInstances
+from fus3dmaps_core.layers.instances import InstanceLayer
+from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.rounding import seeds_of
+from fus3dmaps_core.voxels.hash import VoxelHash
+
+_UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
+
+
+class MapState:
+    """One voxel hash and everything that is kept of its voxels and of the instances.
+
+    Attributes:
+        hash: Voxel keys to slots.
+        colors: (slots, 3) uint8.
+        dense: The dense layer.
+        instances: The instance layer.
+        fused: Fused embeddings of the instances.
+    """
+
+    def __init__(self, dimension: int, config: MapConfig, windowed: bool, kernels: Kernels) -> None:
+        """Start empty."""
+        device = torch.device(config.device)
+        self._device = device
+        self.hash = VoxelHash(kernels, device)
+        self.colors = Column(torch.uint8, _UNSEEN_COLOR, device, width=3)
+        self.dense = DenseLayer(dimension, getattr(torch, config.dtype), kernels, device)
+        self.instances = InstanceLayer(dimension, config.max_hypotheses, config.iou_threshold, kernels, device)
+        self.fused = FusedInstances(dimension, windowed, device)
+
+    def slots(self, keys: Tensor) -> Tensor:
+        """Slots of distinct keys, (n,) int64; voxels that the map lacks are made."""
+        slots = self.hash.find_or_insert(keys)
+        count = self.hash.high_water
+        self.colors.reserve(count)
+        self.dense.reserve(count)
+        self.instances.reserve(count)
+        return slots
+
+    def remove(self, slots: Tensor) -> None:
+        """Forget the voxels of distinct slots, and instances that are left without one."""
+        rows = self.dense.rows(slots)
+        self.dense.drop(rows[rows >= 0])
+        self.instances.forget(slots)
+        self.colors[slots] = _UNSEEN_COLOR
+        self.hash.remove(slots)
+
+    def nbytes(self) -> dict[str, int]:
+        """Allocated bytes by part; the hash counts all that a voxel takes without evidence: key, cells, link to a row."""
+        return {
+            "hash": self.hash.nbytes + self.dense.link_nbytes,
+            "colors": self.colors.nbytes,
+            "dense": self.dense.nbytes - self.dense.link_nbytes,
+            "instances": self.instances.nbytes + self.fused.nbytes,
+        }
+
+    def export(self) -> dict[str, NDArray[Any]]:
+        """Everything as arrays by name, voxels in the order of their slots.
+
+        Returns:
+            voxel_coordinates (n, 3) int32; voxel_colors (n, 3) uint8; dense_slot (m,) int32, places among the n;
+            dense_weight (m,) float32; dense_embedding (m, d) in the storage type; for int8 dense_scale (m,) float32;
+            hypothesis_id, hypothesis_count (n, K) int32; instance_id (i,) int64; instance_weight (i,) float64;
+            instance_embedding (i, d) float32; fused_embedding (i, d) float32; fused_evidence (i,) float64, 0 before the
+            first fusion; next_instance_id () int64.
+        """
+        slots = self.hash.live()
+        rows = self.dense.rows(slots)
+        has_dense = torch.nonzero(rows >= 0).squeeze(1)
+        rows = rows[has_dense]
+        stored, scales = self.dense.pool.read_stored(rows)
+        ids, instance_rows = self.instances.live()
+        held, counts = self.instances.hypotheses(slots)
+        state = {
+            "voxel_coordinates": self.hash.coordinates(slots).to(torch.int32),
+            "voxel_colors": self.colors[slots],
+            "dense_slot": has_dense.to(torch.int32),
+            "dense_weight": self.dense.weights(rows),
+            "dense_embedding": stored,
+            "hypothesis_id": self.instances.ids(held).to(torch.int32),
+            "hypothesis_count": counts.to(torch.int32),
+            "instance_id": ids,
+            "instance_weight": self.instances.weights(instance_rows),
+            "instance_embedding": self.instances.pool.read(instance_rows),
+            "fused_embedding": self.fused.stored(instance_rows, self.instances),
+            "fused_evidence": self.fused.evidence(instance_rows),
+            "next_instance_id": torch.tensor(self.instances.next_id),
+        }
+        if stored.dtype == torch.int8:
+            state["dense_scale"] = scales
+        return {name: tensor.cpu().numpy() for name, tensor in state.items()}
+
+    def fill(self, state: dict[str, NDArray[Any]]) -> None:
+        """Take over an exported and checked state; only for a map that is empty."""
+        tensors = {name: torch.from_numpy(np.array(array)).to(self._device) for name, array in state.items()}
+        keys = pack(tensors["voxel_coordinates"])
+        slots = self.slots(keys)
+        self.colors[slots] = tensors["voxel_colors"]
+        self._fill_dense(tensors, slots, keys)
+        rows = self.instances.restore(
+            slots,
+            tensors["hypothesis_id"],
+            tensors["hypothesis_count"],
+            int(tensors["next_instance_id"]),
+            tensors["instance_id"],
+            tensors["instance_weight"],
+            tensors["instance_embedding"].to(torch.float32),
+        )
+        self.fused.restore(rows, tensors["fused_embedding"].to(torch.float32), tensors["fused_evidence"])
+
+    def _fill_dense(self, tensors: dict[str, Tensor], slots: Tensor, keys: Tensor) -> None:
+        place, weights = tensors["dense_slot"].to(torch.int64), tensors["dense_weight"].to(torch.float32)
+        stored = tensors["dense_embedding"]
+        rows = self.dense.admit(slots[place], weights)
+        if stored.dtype == self.dense.pool.dtype:
+            self.dense.pool.write_stored(rows, stored, tensors.get("dense_scale"))
+            return
+        values = stored.to(torch.float32)
+        if stored.dtype == torch.int8:
+            values *= tensors["dense_scale"][:, None]
+        self.dense.pool.write(rows, values, seeds_of(keys[place], weights))

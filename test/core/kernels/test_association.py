@@ -1,0 +1,234 @@
+"""Association and hypotheses, on every backend, against dictionaries."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
+
+from fus3dmaps_core.kernels.keys import MAX_COORDINATE, pack
+from fus3dmaps_core.kernels.protocols import EMPTY, Extents, Hypotheses, Pairs, SlotBlock
+
+_seeds = st.integers(0, 2**32 - 1)
+MAX_COUNT = 2**31 - 1
+
+
+@pytest.fixture(scope="module", params=BACKENDS, ids=BACKEND_IDS)
+def backend(request):
+    """Kernels and their device."""
+    return kernels_of(*request.param), torch.device(request.param[1])
+
+
+def columns(held: list[dict[int, int]], places: int, id_of_row: list[int], device: torch.device, rng) -> Hypotheses:
+    """Columns of voxels that hold rows with counts, each voxel's in any order."""
+    rows, counts = np.full((len(held), places), -1, np.int32), np.zeros((len(held), places), np.int32)
+    for slot, of_voxel in enumerate(held):
+        order = rng.permutation(places)[: len(of_voxel)]
+        rows[slot, order], counts[slot, order] = list(of_voxel), list(of_voxel.values())
+    flat = [(row, count) for of_voxel in held for row, count in of_voxel.items()]
+    voxels = Counter(row for row, _ in flat)
+    observations = [sum(count for row, count in flat if row == each) for each in range(len(id_of_row))]
+    arrays = (
+        rows,
+        counts,
+        np.array(id_of_row, np.int64),
+        np.array([voxels[each] for each in range(len(id_of_row))], np.int32),
+        np.array(observations, np.int64),
+        np.zeros(len(id_of_row), bool),
+    )
+    return Hypotheses(*(torch.tensor(each, device=device) for each in arrays))
+
+
+class PlainAssociation:
+    """The method's association in dictionaries of ids."""
+
+    def __init__(self, held: list[dict[int, int]], places: int, next_id: int, threshold: float) -> None:
+        self.held, self.places, self.next_id, self.threshold = held, places, next_id, threshold
+        self.changed: set[int] = set()
+
+    def take(self, hits: dict[int, int]) -> int:
+        overlap = {}
+        for each in {each for slot in hits for each in self.held[slot]}:
+            members = {slot for slot, of_voxel in enumerate(self.held) if each in of_voxel}
+            overlap[each] = len(members & hits.keys()) / len(members | hits.keys())
+        best = max(overlap.values(), default=0.0)
+        if best > self.threshold:
+            matched = min(each for each, value in overlap.items() if value == best)
+        else:
+            matched, self.next_id = self.next_id, self.next_id + 1
+        self.changed.add(matched)
+        for slot, points in hits.items():
+            of_voxel = self.held[slot]
+            if matched not in of_voxel and len(of_voxel) == self.places:
+                loser = min(of_voxel, key=lambda each: (of_voxel[each], each))
+                self.changed.add(loser)
+                del of_voxel[loser]
+            of_voxel[matched] = min(of_voxel.get(matched, 0) + points, MAX_COUNT)
+        return matched
+
+
+def test_proposals_are_associated_counted_and_displace_as_in_dictionaries(backend):
+    kernels, device = backend
+
+    @settings(max_examples=120)
+    @given(_seeds, st.integers(1, 4), st.sampled_from([0.0, 0.2, 0.5]), st.integers(1, 14), st.integers(0, 6))
+    def check(seed, places, threshold, slots, proposals):
+        rng = np.random.default_rng(seed)
+        # Rows of instances in an order that is not that of their ids, with rows of none between them.
+        ids = rng.choice(40, 6, replace=False).tolist()
+        by_id = [
+            {
+                int(each): int(rng.choice([1, 2, 3, MAX_COUNT - 1]))
+                for each in rng.permutation(ids)[: rng.integers(0, places + 1)]
+            }
+            for _ in range(slots)
+        ]
+        alive = {each for of_voxel in by_id for each in of_voxel}
+        row_of_id = dict(
+            zip(sorted(alive, key=lambda each: each * 7 % 11), rng.permutation(20)[: len(alive)].tolist(), strict=True)
+        )
+        id_of_row = [next((each for each, row in row_of_id.items() if row == number), -1) for number in range(20)]
+        held = columns(
+            [{row_of_id[each]: count for each, count in of_voxel.items()} for of_voxel in by_id],
+            places,
+            id_of_row,
+            device,
+            rng,
+        )
+        hits = [
+            {int(slot): int(rng.integers(1, 4)) for slot in rng.permutation(slots)[: rng.integers(0, slots + 1)]}
+            for _ in range(proposals)
+        ]
+        groups = Pairs(
+            *(
+                torch.tensor(np.array(each, np.int64), device=device)
+                for each in (
+                    np.cumsum([0, *map(len, hits)]),
+                    [slot for each in hits for slot in each],
+                    [count for each in hits for count in each.values()],
+                )
+            )
+        )
+        spare = [row for row in range(20) if id_of_row[row] < 0][:proposals]
+        outcome = kernels.integrate(held, groups, torch.tensor(spare, dtype=torch.int64, device=device), 100, threshold)
+
+        plain = PlainAssociation([dict(of_voxel) for of_voxel in by_id], places, 100, threshold)
+        expected = [plain.take(each) if each else -1 for each in hits]
+        assert outcome.ids.tolist() == expected
+        assert outcome.created == plain.next_id - 100
+        born = {100 + number: spare[number] for number in range(outcome.created)}
+        row_of_id |= born
+        assert outcome.rows.tolist() == [row_of_id.get(each, -1) for each in expected]
+        left = {each for of_voxel in plain.held for each in of_voxel}
+        died = (alive | born.keys()) - left
+        assert sorted(outcome.dead.tolist()) == sorted(row_of_id[each] for each in died)
+
+        rows, counts = held.held_row.tolist(), held.held_count.tolist()
+        id_now = held.id_of_row.tolist()
+        for slot, of_voxel in enumerate(plain.held):
+            got = {id_now[row]: count for row, count in zip(rows[slot], counts[slot], strict=True) if row >= 0}
+            assert got == of_voxel
+            assert sum(row >= 0 for row in rows[slot]) == len(of_voxel)
+        assert {row: each for row, each in enumerate(id_now) if each >= 0} == {row_of_id[each]: each for each in left}
+        for each in left:
+            members = [of_voxel[each] for of_voxel in plain.held if each in of_voxel]
+            assert held.voxels_of_row[row_of_id[each]] == len(members)
+            assert held.observations_of_row[row_of_id[each]] == sum(members)
+        changed = {row for row, flag in enumerate(held.changed.tolist()) if flag}
+        assert {id_now[row] for row in changed if id_now[row] >= 0} == plain.changed & left
+
+    check()
+
+
+def test_the_top_hypothesis_has_the_highest_count_and_of_equal_ones_the_lowest_id(backend):
+    kernels, device = backend
+
+    @settings(max_examples=60)
+    @given(_seeds, st.integers(1, 4), st.integers(1, 12))
+    def check(seed, places, slots):
+        rng = np.random.default_rng(seed)
+        id_of_row = rng.permutation([-1, 0, 3, 8, 2**31 - 2]).tolist()
+        usable = [row for row in range(5) if id_of_row[row] >= 0]
+        counts = [1, 1, 2, MAX_COUNT, MAX_COUNT]
+        voxels = [
+            {int(row): int(rng.choice(counts)) for row in rng.permutation(usable)[: rng.integers(0, places + 1)]}
+            for _ in range(slots)
+        ]
+        held = columns(voxels, places, id_of_row, device, rng)
+        asked = rng.integers(0, slots, 2 * slots)
+        rows, found = kernels.top_hypotheses(held, torch.tensor(asked, device=device))
+        best = [
+            min(voxels[slot].items(), key=lambda pair: (-pair[1], id_of_row[pair[0]]), default=(-1, 0)) for slot in asked
+        ]
+        assert rows.dtype == found.dtype == torch.int64
+        assert list(zip(rows.tolist(), found.tolist(), strict=True)) == best
+
+    check()
+
+
+def test_without_any_instance_no_voxel_has_a_top_hypothesis(backend):
+    kernels, device = backend
+    held = columns([{}, {}, {}], 3, [], device, np.random.default_rng(0))
+    rows, counts = kernels.top_hypotheses(held, torch.tensor([2, 0], device=device))
+    assert (rows.tolist(), counts.tolist()) == ([-1, -1], [0, 0])
+
+
+def test_a_survey_adds_up_what_instances_occupy_and_picks_voxels_by_layer(backend):
+    kernels, device = backend
+
+    @settings(max_examples=60)
+    @given(_seeds, st.integers(0, 40), st.integers(1, 3), st.booleans(), st.booleans())
+    def check(seed, count, parts, with_dense, with_instance):
+        rng = np.random.default_rng(seed)
+        spans = rng.choice([2, 1000, MAX_COORDINATE], (count, 1))
+        coordinates = rng.integers(-spans, spans + 1, (count, 3))
+        alive = rng.random(count) < 0.9
+        dense_rows = np.where(alive & (rng.random(count) < 0.6), rng.permutation(count), -1)
+        id_of_row = [4, -1, 9, 2, 7]
+        voxels = [
+            {int(row): int(rng.integers(1, 1000)) for row in rng.permutation([0, 2, 3, 4])[: rng.integers(0, 4)]}
+            if each
+            else {}
+            for each in alive
+        ]
+        held = columns(voxels, 3, id_of_row, device, rng)
+        keys = torch.where(torch.tensor(alive), pack(torch.tensor(coordinates)), EMPTY).to(device)
+        none, nowhere = (
+            torch.zeros(5, dtype=torch.int64, device=device),
+            torch.zeros((5, 3), dtype=torch.int64, device=device),
+        )
+        far = torch.full_like(nowhere, 2**62)
+        extents = Extents(voxels=none, counts=none.clone(), sums=nowhere, low=far, high=-far)
+        picked = []
+        for part in np.array_split(np.arange(count), parts):
+            first, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
+            rows = torch.tensor(dense_rows[first:end].astype(np.int32), device=device)
+            block = SlotBlock(first=first, keys=keys[first:end], dense_rows=rows, voxel_size_m=0.25)
+            found = kernels.survey(block, held, extents, with_dense, with_instance)
+            picked += zip(
+                *(each.tolist() for each in (found.centers_m, found.dense_rows, found.top_rows, found.top_counts)),
+                strict=True,
+            )
+
+        tops = [min(each.items(), key=lambda pair: (-pair[1], id_of_row[pair[0]]), default=(-1, 0)) for each in voxels]
+        expected = [
+            ([float(np.float32((value + 0.5) * 0.25)) for value in coordinates[slot]], dense_rows[slot], *tops[slot])
+            for slot in range(count)
+            if (with_dense and dense_rows[slot] >= 0) or (with_instance and tops[slot][0] >= 0)
+        ]
+        assert picked == expected
+        owners, counts = (np.array([top[axis] for top in tops], np.int64) for axis in (0, 1))
+        for row in range(5):
+            mine = owners == row
+            assert extents.voxels[row] == mine.sum()
+            assert extents.counts[row] == counts[mine].sum()
+            assert extents.sums[row].tolist() == (counts[mine, None] * coordinates[mine]).sum(axis=0).tolist()
+            assert extents.low[row].tolist() == (coordinates[mine].min(axis=0).tolist() if mine.any() else [2**62] * 3)
+            assert extents.high[row].tolist() == (coordinates[mine].max(axis=0).tolist() if mine.any() else [-(2**62)] * 3)
+
+    check()

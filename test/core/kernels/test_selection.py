@@ -1,0 +1,77 @@
+"""Which kernels a map gets, and what it is told when it cannot have them."""
+
+from __future__ import annotations
+
+import logging
+import sys
+
+import numpy as np
+import pytest
+import torch
+from reference.variants import BACKENDS
+
+from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.errors import ConfigError
+from fus3dmaps_core.kernels import selection
+from fus3dmaps_core.kernels.selection import select_kernels
+from fus3dmaps_core.kernels.torch_kernels import TorchKernels
+from fus3dmaps_core.semantic_map import SemanticMap
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+
+
+@pytest.fixture
+def without_numba(monkeypatch):
+    """As if numba were not installed."""
+    monkeypatch.setitem(sys.modules, "numba", None)
+    for name in [each for each in sys.modules if each.startswith("fus3dmaps_core.kernels.") and "numba" in each]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.delitem(sys.modules, "fus3dmaps_core.kernels.compiled_kernels", raising=False)
+    # The package's own attributes would stand in for the modules that are gone.
+    for name in ("compiled_kernels", "numba_points", "numba_rows", "numba_instances"):
+        monkeypatch.delattr(f"fus3dmaps_core.kernels.{name}", raising=False)
+    selection._compiled.cache_clear()
+    yield
+    selection._compiled.cache_clear()
+
+
+def test_torch_is_taken_where_it_is_asked_for_and_off_the_cpu():
+    assert isinstance(select_kernels("torch", CPU), TorchKernels)
+    assert isinstance(select_kernels("auto", CUDA), TorchKernels)
+    assert isinstance(select_kernels("torch", CUDA), TorchKernels)
+
+
+def test_auto_takes_compiled_kernels_on_a_cpu_that_has_them():
+    has_compiled = ("compiled", "cpu") in BACKENDS
+    assert isinstance(select_kernels("auto", CPU), TorchKernels) is not has_compiled
+
+
+def test_compiled_kernels_are_refused_off_the_cpu():
+    with pytest.raises(ConfigError, match=r"map\.backend.*CPU.*map\.device.*cuda"):
+        select_kernels("compiled", CUDA)
+    with pytest.raises(ConfigError, match=r"map\.backend"):
+        SemanticMap(4, MapConfig(backend="compiled", device="cuda:0"), 1.0)
+
+
+def test_without_numba_auto_takes_torch_and_says_so_once(without_numba, caplog):
+    with caplog.at_level(logging.WARNING):
+        assert isinstance(select_kernels("auto", CPU), TorchKernels)
+        assert isinstance(select_kernels("auto", CPU), TorchKernels)
+    (record,) = [each for each in caplog.records if "numba" in each.getMessage()]
+    assert record.levelno == logging.WARNING
+    assert "slower" in record.getMessage()
+
+
+def test_without_numba_compiled_is_refused_by_name(without_numba):
+    with pytest.raises(ConfigError, match=r"map\.backend.*numba"):
+        select_kernels("compiled", CPU)
+    with pytest.raises(ConfigError, match="numba"):
+        SemanticMap(4, MapConfig(backend="compiled"), 1.0)
+
+
+def test_without_numba_a_map_works(without_numba):
+    semantic_map = SemanticMap(4, MapConfig(), 1.0)
+    point, none = np.full((1, 3), 0.01), np.zeros(1, int)
+    semantic_map.integrate_dense(point, none, np.ones((1, 4)), np.ones(1), np.zeros((1, 3), np.uint8))
+    assert semantic_map.integrate_proposals(point, none, np.ones((1, 4))).tolist() == [0]
+    assert semantic_map.fuse().updated == 1
