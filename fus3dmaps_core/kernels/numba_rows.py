@@ -107,21 +107,29 @@ def _address(kind: int, addresses: NDArray[np.int64], block_rows: int, width: in
 
 
 @njit(**_OPTIONS)
-def _load(kind: int, address: int, scale: np.float32, values: NDArray[np.float32]) -> None:
-    """Read len(values) stored values from an address on."""
+def _load(kind: int, address: int, scale: np.float32, values: NDArray[np.float32]) -> np.float32:
+    """Read len(values) stored values from an address on; returns the sum of their squares."""
     n = len(values)
+    squares = np.float32(0.0)
     if kind == FLOAT32:
         floats = carray(_float32_at(address), (n,))
         for c in range(n):
-            values[c] = floats[c]
+            value = floats[c]
+            values[c] = value
+            squares += value * value
     elif kind == FLOAT16:
         halves = carray(_uint16_at(address), (n,))
         for c in range(n):
-            values[c] = _half_to_float(halves[c])
+            value = _half_to_float(halves[c])
+            values[c] = value
+            squares += value * value
     else:
         steps = carray(_int8_at(address), (n,))
         for c in range(n):
-            values[c] = scale * np.float32(steps[c])
+            value = scale * np.float32(steps[c])
+            values[c] = value
+            squares += value * value
+    return squares
 
 
 @njit(**_OPTIONS)
@@ -193,11 +201,10 @@ def merge_means(
 
 
 @njit(**_OPTIONS)
-def _dots(values: NDArray[np.float32], texts: NDArray[np.float32], cosines: NDArray[np.float32]) -> None:
-    """Cosines of one vector with unit vectors."""
-    squares = np.float32(0.0)
-    for c in range(len(values)):
-        squares += values[c] * values[c]
+def _dots(
+    values: NDArray[np.float32], squares: np.float32, texts: NDArray[np.float32], cosines: NDArray[np.float32]
+) -> None:
+    """Cosines of one vector, whose squares' sum is given, with unit vectors."""
     scale = np.float32(1.0) / max(np.sqrt(squares), _TINY)
     for p in range(len(texts)):
         text, dot = texts[p], np.float32(0.0)
@@ -223,8 +230,8 @@ def cosines(
     values = np.empty(width, np.float32)
     for i in range(start, stop):
         scale = scales[rows[i]] if kind == INT8 else np.float32(0.0)
-        _load(kind, _address(kind, addresses, block_rows, width, rows[i]), scale, values)
-        _dots(values, texts, found[i])
+        squares = _load(kind, _address(kind, addresses, block_rows, width, rows[i]), scale, values)
+        _dots(values, squares, texts, found[i])
 
 
 @njit(**_OPTIONS)
@@ -249,10 +256,10 @@ def fused_cosines(
     values, own = np.empty(width, np.float32), np.empty(width, np.float32)
     loaded = np.int64(-1)
     for i in range(start, stop):
-        row, own_row = rows[i], own_rows[i]
+        row, own_row, squares = rows[i], own_rows[i], np.float32(0.0)
         if row >= 0:
             scale = scales[row] if kind == INT8 else np.float32(0.0)
-            _load(kind, _address(kind, addresses, block_rows, width, row), scale, values)
+            squares = _load(kind, _address(kind, addresses, block_rows, width, row), scale, values)
         if own_row >= 0:
             if own_row != loaded:  # Neighbouring voxels mostly belong to one object.
                 _load(FLOAT32, _address(FLOAT32, own_addresses, own_block_rows, width, own_row), np.float32(0.0), own)
@@ -263,9 +270,12 @@ def fused_cosines(
                 rest = own_weights[i] / (weights[i] + own_weights[i])
             else:
                 values[:] = 0.0
+            squares = np.float32(0.0)
             for c in range(width):
-                values[c] = share * values[c] + rest * own[c]
-        _dots(values, texts, found[i])
+                value = share * values[c] + rest * own[c]
+                values[c] = value
+                squares += value * value
+        _dots(values, squares, texts, found[i])
 
 
 @njit(**_OPTIONS)
