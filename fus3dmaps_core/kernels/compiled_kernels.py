@@ -28,7 +28,7 @@ from fus3dmaps_core.kernels.protocols import (
 from fus3dmaps_core.memory.rows import RowPool
 
 _KINDS = {torch.float32: numba_rows.FLOAT32, torch.float16: numba_rows.FLOAT16, torch.int8: numba_rows.INT8}
-_LANES = 4  # Fixed, so that sums over many voxels do not depend on the number of threads.
+_LANES = 2  # Fixed, so that sums over many voxels do not depend on the number of threads; each lane has sums of its own.
 _PART_VALUES = 256 * 1024  # Work of some 0.1 ms: less is not worth a second thread.
 _PARTS_PER_THREAD = 4
 
