@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from fus3dmaps_core.ahead import computed_ahead
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.kernels.protocols import Extents, Pairs, SlotBlock
+from fus3dmaps_core.kernels.protocols import Extents, Pairs, SlotBlock, VoxelBlock
 from fus3dmaps_core.kernels.selection import select_kernels
 from fus3dmaps_core.layers.fusion import FusionInputs
 from fus3dmaps_core.layers.similarity import DenseCosines, FusedDenseCosines, InstanceCosines, LayerCosines
@@ -318,10 +320,13 @@ class SemanticMap:
             place[rows + 1] = torch.arange(len(rows), device=self._device)  # The first stays -1, for row -1.
             step = min(block_slots, _BLOCK_SLOTS)
             with_dense, with_instance = (False, False) if cosines is None else (cosines.with_dense, cosines.with_instance)
-            for first in range(0, state.hash.high_water, step):
+
+            def survey(first: int) -> VoxelBlock:
                 slots = slice(first, min(first + step, state.hash.high_water))
                 block = SlotBlock(first, state.hash.keys(slots), state.dense.row_of_slot(slots), self.config.voxel_size_m)
-                picked = state.instances.survey(block, extents, with_dense, with_instance)
+                return state.instances.survey(block, extents, with_dense, with_instance)
+
+            for picked in computed_ahead(partial(survey, first) for first in range(0, state.hash.high_water, step)):
                 if cosines is not None and visit is not None and len(picked.top_rows):
                     values, owners = cosines(picked), place.index_select(0, picked.top_rows + 1)
                     visit(
