@@ -202,8 +202,8 @@ class CompiledKernels:
     ) -> tuple[Tensor, Tensor]:
         """As the protocol says."""
         arrays = [each.numpy() for each in (slot_of_row, weight_of_row, held_row, place_of_instance)]
-        sums = np.zeros((_LANES, places, pool.dimension))
-        totals = np.zeros((_LANES, places))
+        sums = [np.zeros((places, pool.dimension)) for _ in range(_LANES)]
+        totals = [np.zeros(places) for _ in range(_LANES)]
 
         def add(lane: int) -> None:
             numba_rows.weighted_sums(*_stored(pool), *arrays, lane, _LANES, sums[lane], totals[lane])

@@ -10,7 +10,7 @@ from fus3dmaps_core.layers.instances import InstanceLayer
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rows import RowPool
 
-_FUSE_SUM_BYTES = 64 * 2**20
+_FUSE_SUM_BYTES = 24 * 2**20  # Below what malloc hands back to the system, which costs as much as the sums themselves.
 _QUERY_SUM_BYTES = 4 * 2**20
 
 
