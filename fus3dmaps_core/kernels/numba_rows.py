@@ -214,6 +214,31 @@ def _dots(
 
 
 @njit(**_OPTIONS)
+def _cosine(kind: int, address: int, scale: np.float32, text: NDArray[np.float32]) -> np.float32:
+    """Cosine of a stored row with one unit vector, in one loop without a copy of the row: what most queries ask."""
+    n = len(text)
+    squares, dot = np.float32(0.0), np.float32(0.0)
+    if kind == FLOAT32:
+        floats = carray(_float32_at(address), (n,))
+        for c in range(n):
+            squares += floats[c] * floats[c]
+            dot += floats[c] * text[c]
+    elif kind == FLOAT16:
+        halves = carray(_uint16_at(address), (n,))
+        for c in range(n):
+            value = _half_to_float(halves[c])
+            squares += value * value
+            dot += value * text[c]
+    else:
+        steps = carray(_int8_at(address), (n,))
+        for c in range(n):
+            value = scale * np.float32(steps[c])
+            squares += value * value
+            dot += value * text[c]
+    return dot / max(np.sqrt(squares), _TINY)
+
+
+@njit(**_OPTIONS)
 def cosines(
     kind: int,
     addresses: NDArray[np.int64],
@@ -230,8 +255,12 @@ def cosines(
     values = np.empty(width, np.float32)
     for i in range(start, stop):
         scale = scales[rows[i]] if kind == INT8 else np.float32(0.0)
-        squares = _load(kind, _address(kind, addresses, block_rows, width, rows[i]), scale, values)
-        _dots(values, squares, texts, found[i])
+        address = _address(kind, addresses, block_rows, width, rows[i])
+        if len(texts) == 1:
+            found[i, 0] = _cosine(kind, address, scale, texts[0])
+        else:
+            squares = _load(kind, address, scale, values)
+            _dots(values, squares, texts, found[i])
 
 
 @njit(**_OPTIONS)
