@@ -32,7 +32,7 @@ from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, SimilarityB
 LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
 """Names of the layers that can be queried."""
 
-_BLOCK_SLOTS = 65536  # Voxels that a query looks at together: a few megabytes of cosines and positions.
+_BLOCK_SLOTS = 32768  # Voxels that a query looks at together: a few megabytes of cosines and positions.
 _BLOCK_COSINES = 2**21
 
 
