@@ -34,7 +34,7 @@ def select_kernels(backend: Backend, device: torch.device) -> Kernels:
     compiled = _compiled()
     if isinstance(compiled, ImportError):
         if backend == "compiled":
-            raise ConfigError(f"parameter 'map.backend': compiled kernels need numba: {compiled}")
+            raise ConfigError(f"parameter 'map.backend': compiled kernels need numba and cannot run: {compiled}")
         return TorchKernels()
     return compiled
 
@@ -44,6 +44,9 @@ def _compiled() -> Kernels | ImportError:
     try:
         # Only here: the package runs without numba, a few times slower.
         from fus3dmaps_core.kernels.compiled_kernels import CompiledKernels
+        from fus3dmaps_core.kernels.processor import check_processor
+
+        check_processor()
     except ImportError as error:  # Also numba's own, when it does not know this numpy.
         _LOG.warning("numba cannot be used, the map runs several times slower than it could: %s", error)
         return error

@@ -75,3 +75,25 @@ def test_without_numba_a_map_works(without_numba):
     semantic_map.integrate_dense(point, none, np.ones((1, 4)), np.ones(1), np.zeros((1, 3), np.uint8))
     assert semantic_map.integrate_proposals(point, none, np.ones((1, 4))).tolist() == [0]
     assert semantic_map.fuse().updated == 1
+
+
+def test_a_processor_without_half_precision_gets_torch_instead_of_a_dead_process(monkeypatch, caplog):
+    """Compiled for a processor without F16C, the first conversion of a half would abort the process."""
+    monkeypatch.setattr("platform.machine", lambda: "x86_64")
+    monkeypatch.setattr("numba.core.config.CPU_FEATURES", "+sse2,-f16c")
+    selection._compiled.cache_clear()
+    try:
+        with caplog.at_level(logging.WARNING):
+            assert isinstance(select_kernels("auto", CPU), TorchKernels)
+        assert "F16C" in caplog.text
+        with pytest.raises(ConfigError, match=r"map\.backend.*F16C"):
+            select_kernels("compiled", CPU)
+        monkeypatch.setattr("numba.core.config.CPU_FEATURES", "+sse2,+f16c")
+        selection._compiled.cache_clear()
+        assert not isinstance(select_kernels("compiled", CPU), TorchKernels)
+        monkeypatch.setattr("platform.machine", lambda: "aarch64")
+        monkeypatch.setattr("numba.core.config.CPU_FEATURES", "+neon")
+        selection._compiled.cache_clear()
+        assert not isinstance(select_kernels("compiled", CPU), TorchKernels)
+    finally:
+        selection._compiled.cache_clear()
