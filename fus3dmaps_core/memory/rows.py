@@ -9,12 +9,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.numbers import Numbers
 from fus3dmaps_core.memory.rounding import to_half, to_int8
 
 _BLOCK_ROWS = {"cpu": 1024, "cuda": 32768}  # A CPU visits blocks in cache-sized steps, a GPU wants few launches.
-_MAX_ROWS = 2**31 - 1  # Rows are held in 32-bit columns.
 
 
 class RowPool:
@@ -38,54 +37,43 @@ class RowPool:
         self.addresses: NDArray[np.int64] = np.zeros(0, np.int64)
         self.scales = Column(torch.float32, 0.0, device)
         self._device = device
-        self._high = 0
-        self._free = Column(torch.int32, -1, device)
-        self._free_count = 0
+        self._numbers = Numbers("embeddings", device)
 
     def __len__(self) -> int:
         """Number of rows in use."""
-        return self._high - self._free_count
+        return len(self._numbers)
 
     @property
     def high_water(self) -> int:
         """One more than the largest row number ever handed out."""
-        return self._high
+        return self._numbers.high_water
 
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
         values = sum(block.numel() * block.element_size() for block in self.blocks)
-        return values + self.addresses.nbytes + self.scales.nbytes + self._free.nbytes
+        return values + self.addresses.nbytes + self.scales.nbytes + self._numbers.nbytes
 
     def check_room(self, count: int) -> None:
         """Raise MapError if ``count`` more rows would be more than 32-bit row numbers can tell apart."""
-        if len(self) + count > _MAX_ROWS:
-            raise MapError(f"the map holds {len(self)} embeddings and cannot number {count} more")
+        self._numbers.check_room(count)
 
     def allocate(self, count: int) -> Tensor:
         """Row numbers for ``count`` new rows, freed ones first: (count,) int64. Their content is undefined."""
-        self.check_room(count)
-        reused = min(count, self._free_count)
-        rows = torch.empty(count, dtype=torch.int64, device=self._device)
-        rows[:reused] = self._free[self._free_count - reused : self._free_count].to(torch.int64)
-        self._free_count -= reused
-        rows[reused:] = torch.arange(self._high, self._high + count - reused, device=self._device)
-        self._high += count - reused
-        while self._high > len(self.blocks) * self.block_rows:
+        rows = self._numbers.take(count)
+        while self.high_water > len(self.blocks) * self.block_rows:
             block = torch.empty((self.block_rows, self.dimension), dtype=self.dtype, device=self._device)
             if len(self.blocks) == len(self.addresses):
                 self.addresses = np.concatenate([self.addresses, np.zeros(max(16, len(self.blocks)), np.int64)])
             self.addresses[len(self.blocks)] = block.data_ptr()
             self.blocks.append(block)
         if self.dtype == torch.int8:
-            self.scales.reserve(self._high)
+            self.scales.reserve(self.high_water)
         return rows
 
     def free(self, rows: Tensor) -> None:
         """Give rows back; each must be in use and appear once."""
-        self._free.reserve(self._free_count + len(rows))
-        self._free[self._free_count : self._free_count + len(rows)] = rows.to(torch.int32)
-        self._free_count += len(rows)
+        self._numbers.give_back(rows)
 
     def read(self, rows: Tensor) -> Tensor:
         """Values of the rows: (n, d) float32."""

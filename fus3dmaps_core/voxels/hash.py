@@ -9,13 +9,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.kernels.keys import unpack
 from fus3dmaps_core.kernels.protocols import EMPTY, HashTable, Kernels
 from fus3dmaps_core.memory.columns import Column
+from fus3dmaps_core.memory.numbers import Numbers
 
 _MAX_LOAD = 0.5  # Linear probing stays at one or two probes up to here; deleted cells count.
-_MAX_SLOTS = 2**31 - 1  # Slots are held in 32-bit columns.
 
 
 class VoxelHash:
@@ -26,20 +25,18 @@ class VoxelHash:
         self._kernels = kernels
         self._device = device
         self._keys = Column(torch.int64, EMPTY, device)
-        self._high = 0
-        self._free = Column(torch.int32, -1, device)
-        self._free_count = 0
+        self._slots = Numbers("voxels", device)
         self._table = self._new_table(1024)
         self._used_cells = 0
 
     def __len__(self) -> int:
         """Number of voxels."""
-        return self._high - self._free_count
+        return len(self._slots)
 
     @property
     def high_water(self) -> int:
         """One more than the largest slot ever given."""
-        return self._high
+        return self._slots.high_water
 
     def keys(self, slots: Tensor | slice) -> Tensor:
         """Keys of the slots, EMPTY where a slot has no voxel."""
@@ -47,7 +44,7 @@ class VoxelHash:
 
     def live(self) -> Tensor:
         """Slots of all voxels, ascending: (n,) int64."""
-        return torch.nonzero(self._keys[: self._high] != EMPTY).squeeze(1)
+        return torch.nonzero(self._keys[: self.high_water] != EMPTY).squeeze(1)
 
     def coordinates(self, slots: Tensor | slice) -> Tensor:
         """Voxel coordinates of slots that have a voxel: (n, 3) int64."""
@@ -74,9 +71,8 @@ class VoxelHash:
         fresh = keys.masked_select(missing)
         if not len(fresh):
             return slots
-        if len(self) + len(fresh) > _MAX_SLOTS:
-            raise MapError(f"the map holds {len(self)} voxels and cannot number {len(fresh)} more")
-        given = self._take_slots(len(fresh))
+        given = self._slots.take(len(fresh))
+        self._keys.reserve(self.high_water)
         slots.masked_scatter_(missing, given)
         self._keys[given] = fresh
         if self._used_cells + len(fresh) > _MAX_LOAD * len(self._table.keys):
@@ -90,25 +86,13 @@ class VoxelHash:
         """Forget the voxels of distinct slots; the slots will be given to others."""
         self._kernels.bury(self._table, self._keys[slots])
         self._keys[slots] = EMPTY
-        self._free.reserve(self._free_count + len(slots))
-        self._free[self._free_count : self._free_count + len(slots)] = slots.to(torch.int32)
-        self._free_count += len(slots)
+        self._slots.give_back(slots)
 
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
         tables = (self._table.keys, self._table.slots)
-        return self._keys.nbytes + self._free.nbytes + sum(table.numel() * table.element_size() for table in tables)
-
-    def _take_slots(self, count: int) -> Tensor:
-        reused = min(count, self._free_count)
-        slots = torch.empty(count, dtype=torch.int64, device=self._device)
-        slots[:reused] = self._free[self._free_count - reused : self._free_count].to(torch.int64)
-        self._free_count -= reused
-        slots[reused:] = torch.arange(self._high, self._high + count - reused, device=self._device)
-        self._high += count - reused
-        self._keys.reserve(self._high)
-        return slots
+        return self._keys.nbytes + self._slots.nbytes + sum(table.numel() * table.element_size() for table in tables)
 
     def _new_table(self, cells: int) -> HashTable:
         return HashTable(

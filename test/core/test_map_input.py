@@ -13,8 +13,7 @@ from reference.steps import Setting
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.memory import rows as pooled_rows
-from fus3dmaps_core.voxels import hash as voxel_hash
+from fus3dmaps_core.memory import numbers
 
 DENSE = {
     "points_m": np.array([[0.01, 0.02, 0.03], [9.0, 9.0, 9.0]]),
@@ -158,17 +157,17 @@ def test_a_visitor_that_fails_leaves_no_trace(setting: Setting):
         engine.visit_similarity("fused_dense", np.ones((1, 5)), fail)
 
 
-@pytest.mark.parametrize("module", [voxel_hash, pooled_rows], ids=["slots", "rows"])
-def test_a_full_map_refuses_more_and_nothing_is_lost(setting: Setting, module, monkeypatch):
+@pytest.mark.parametrize("what", ["voxels", "embeddings"])
+def test_a_full_map_refuses_more_and_nothing_is_lost(setting: Setting, what: str, monkeypatch):
     engine = used_map(setting)
-    limit, count = ("_MAX_SLOTS", engine.voxel_count) if module is voxel_hash else ("_MAX_ROWS", engine.instance_count)
+    count = engine.voxel_count if what == "voxels" else engine.instance_count
     far_m = np.array([[7.0, 7.0, 7.0], [8.0, 8.0, 8.0]])
     before = engine.export_state()
     with monkeypatch.context() as full:
-        full.setattr(module, limit, count + 1)
-        with pytest.raises(MapError):
+        full.setattr(numbers, "_LIMIT", count + 1)
+        with pytest.raises(MapError, match=f"{count} {what}"):
             engine.integrate_proposals(**{**PROPOSALS, "points_m": far_m})
-        if module is voxel_hash:
+        if what == "voxels":
             with pytest.raises(MapError, match=f"{count} voxels"):
                 engine.integrate_dense(**{**DENSE, "points_m": far_m})
     assert_same_bytes(engine.export_state(), before)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reference.variants import DEVICES, DTYPES
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.memory import rows as pooled_rows
+from fus3dmaps_core.memory import numbers
 from fus3dmaps_core.memory.rows import RowPool
 
 BLOCK_ROWS = RowPool(1, torch.float32, torch.device("cpu")).block_rows
@@ -149,7 +149,7 @@ def test_growing_moves_no_row():
 
 
 def test_more_rows_than_can_be_numbered_are_refused_before_anything_is_touched(monkeypatch):
-    monkeypatch.setattr(pooled_rows, "_MAX_ROWS", 5)
+    monkeypatch.setattr(numbers, "_LIMIT", 5)
     pool = RowPool(2, torch.float32, torch.device("cpu"))
     rows = pool.allocate(4)
     pool.check_room(1)

@@ -12,7 +12,7 @@ from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
 from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.kernels.keys import MAX_COORDINATE, pack
 from fus3dmaps_core.kernels.protocols import EMPTY
-from fus3dmaps_core.voxels import hash as voxel_hash
+from fus3dmaps_core.memory import numbers
 from fus3dmaps_core.voxels.hash import VoxelHash
 
 _axis = st.one_of(
@@ -153,7 +153,7 @@ def test_looking_for_a_voxel_does_not_add_it(new_hash):
 
 
 def test_more_voxels_than_slots_are_refused_before_anything_is_touched(new_hash, monkeypatch):
-    monkeypatch.setattr(voxel_hash, "_MAX_SLOTS", 5)
+    monkeypatch.setattr(numbers, "_LIMIT", 5)
     table, device = new_hash()
     known = keys_of([(x, 0, 0) for x in range(4)], device)
     slots = table.find_or_insert(known)
@@ -167,7 +167,7 @@ def test_more_voxels_than_slots_are_refused_before_anything_is_touched(new_hash,
 
 
 def test_what_fits_after_removals_is_not_refused(new_hash, monkeypatch):
-    monkeypatch.setattr(voxel_hash, "_MAX_SLOTS", 3)
+    monkeypatch.setattr(numbers, "_LIMIT", 3)
     table, device = new_hash()
     for x in range(20):
         slots = table.find_or_insert(keys_of([(x, 0, 0), (x, 1, 0), (x, 2, 0)], device))
