@@ -122,8 +122,8 @@ class SemanticMap:
         color_sums.index_add_(0, voxels, torch.from_numpy(colors.astype(np.int64)).to(self._device))
         mean_colors = ((2 * color_sums + counts[:, None]) // (2 * counts[:, None])).to(torch.uint8)
         if not bool((patch_weights > 0).all()):
-            useful = patch_weights[patch_index] > 0
-            voxels, patch_index = voxels[useful], patch_index[useful]
+            useful = patch_weights.index_select(0, patch_index) > 0
+            voxels, patch_index = voxels.masked_select(useful), patch_index.masked_select(useful)
         observations = self._kernels.count_pairs(voxels, patch_index, len(keys), len(unit))
         with self._lock:
             slots = self._state.slots(keys)
@@ -205,7 +205,7 @@ class SemanticMap:
         keys, _, _ = self._kernels.distinct(keys)
         with self._lock:
             slots = self._state.hash.find(keys)
-            slots = slots[slots >= 0]
+            slots = slots.masked_select(slots >= 0)
             if len(slots):
                 self._state.remove(slots)
             return len(slots)
