@@ -126,11 +126,9 @@ class InstanceLayer:
 
         Returns:
             Id of each proposal's instance, (m,) int64, -1 for one without points; and rows of the instances that it made.
-
         """
         spare = self.pool.allocate(len(embeddings))
-        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
-            column.reserve(self.pool.high_water)
+        self._reserve_rows()
         outcome = self._kernels.integrate(self._columns(), proposals, spare, self.next_id, self._iou_threshold)
         self._average(outcome.rows, proposals, embeddings)
         self.next_id += outcome.created
@@ -171,8 +169,7 @@ class InstanceLayer:
         """
         self.next_id = next_id
         rows = self.pool.allocate(len(alive))
-        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
-            column.reserve(self.pool.high_water)
+        self._reserve_rows()
         self._id_of_row[rows] = alive
         self._weight_of_row[rows] = weights
         self._changed[rows] = True
@@ -203,6 +200,10 @@ class InstanceLayer:
             self._changed,
         )
         return self.pool.nbytes + sum(column.nbytes for column in columns)
+
+    def _reserve_rows(self) -> None:
+        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
+            column.reserve(self.pool.high_water)
 
     def _columns(self) -> Hypotheses:
         rows = slice(0, self.pool.high_water)
