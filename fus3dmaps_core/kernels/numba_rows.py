@@ -1,7 +1,7 @@
 """Compiled loops over embedding rows: reading and writing every storage type, means, cosines and fusion sums.
 
 Rows live in blocks whose addresses are handed over, so that a row is found without searching and a pool can grow without
-moving. Storage types are told apart once a row; everything is computed in float32 (sums over many voxels in float64).
+moving. Storage types are told apart once a row; everything is computed in float32, and sums over blocks in float64.
 Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
 """
 
@@ -21,8 +21,8 @@ from fus3dmaps_core.memory.rounding import FRESH_SCALE_STEPS, KEEP_SCALE_ABOVE, 
 FLOAT32, FLOAT16, INT8 = 0, 1, 2
 """How a pool stores its values."""
 
-
-# Sums may be reordered, which lets the compiler use vector instructions; NaN and infinity keep their meaning.
+# Sums may be reordered, which lets the compiler use vector instructions. It also lets it take x - x for 0, so that isfinite
+# is true of infinity here: values are compared with bounds instead.
 _OPTIONS: dict[str, Any] = {
     "cache": True,
     "nogil": True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -147,7 +148,7 @@ def fitted_slope(at: Sequence[float], values: Sequence[float]) -> float:
 def resident_bytes() -> int:
     """Resident memory of this process, as Linux tells it."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * 4096
+    return pages * resource.getpagesize()
 
 
 def _process(
