@@ -51,14 +51,14 @@ def weight_tensor(weights: NDArray[np.floating], length: int, device: torch.devi
     return tensor
 
 
-def unit_rows(embeddings: NDArray[np.floating], dimension: int, kernels: Kernels, device: torch.device) -> Tensor:
+def unit_rows(name: str, embeddings: NDArray[np.floating], dimension: int, kernels: Kernels, device: torch.device) -> Tensor:
     """Embeddings (n, d) of any length but 0, scaled to unit length: float32."""
     shape = (*embeddings.shape[:1], dimension)
     if embeddings.shape != shape or not np.issubdtype(embeddings.dtype, np.floating):
-        raise MapError(f"embeddings: must be {shape} floating point, got {embeddings.shape} {embeddings.dtype}")
+        raise MapError(f"{name}: must be {shape} floating point, got {embeddings.shape} {embeddings.dtype}")
     units, failure = kernels.unit_rows(_tensor(embeddings, device))
     if failure:
-        raise MapError("embeddings: a row has length 0" if failure == 2 else "embeddings: has values that are not finite")
+        raise MapError(f"{name}: " + ("a row has length 0" if failure == 2 else "has values that are not finite"))
     return units
 
 

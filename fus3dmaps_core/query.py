@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.encoders.protocols import TextEncoder
 from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
-from fus3dmaps_core.snapshots import InstanceSnapshot, SimilarityBlock
+from fus3dmaps_core.layers.similarity import LAYERS
+from fus3dmaps_core.search import Finding
+from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.snapshots import InstanceSnapshot
 
 DEFAULT_LAYER = "fused_instances"
 _MAX_PROMPT_LENGTH = 4096
@@ -114,71 +116,30 @@ def answer_query(semantic_map: SemanticMap, text_encoder: TextEncoder, query: Te
     if semantic_map.voxel_count == 0:
         raise QueryError("the map is empty: nothing has been mapped yet")
     texts = text_encoder.encode_text([*query.prompts, *query.negative_prompts])
-    collector = _Collector(query, logit_scale)
-    instances = semantic_map.visit_similarity(query.layer, texts, collector.add)
-    if not collector.voxels:
+    positive, negative = texts[: len(query.prompts)], texts[len(query.prompts) :]
+    found = semantic_map.search(
+        query.layer,
+        positive,
+        negative if len(negative) else None,
+        logit_scale,
+        query.threshold,
+        query.top_k,
+        query.min_voxels,
+    )
+    if not found.voxels:
         raise QueryError(f"layer: '{query.layer}' is empty in this map")
-    return QueryAnswer(query.layer, *collector.points(), collector.ranked(instances))
+    return QueryAnswer(query.layer, found.points_m, found.similarity, _ranked(query, found))
 
 
-class _Collector:
-    """Gathers an answer from blocks of voxels; beside the answer it holds sums for each instance only."""
-
-    def __init__(self, query: TextQuery, logit_scale: float) -> None:
-        self._query, self._logit_scale = query, logit_scale
-        self._points_m = np.empty((0, 3), np.float32)
-        self._best = np.empty(0, np.float32)
-        self._kept = 0
-        self._totals = np.zeros((len(query.prompts), 0))
-        self._members = np.zeros(0, np.int64)
-        self.voxels = 0
-
-    def add(self, block: SimilarityBlock) -> None:
-        """Take the next voxels."""
-        if not self.voxels:
-            # As large as the answer can become; pages that are never written are never real.
-            self._points_m, self._best = np.empty((block.map_voxels, 3), np.float32), np.empty(block.map_voxels, np.float32)
-            self._totals = np.zeros((len(self._query.prompts), block.map_instances))
-            self._members = np.zeros(block.map_instances, np.int64)
-        self.voxels += len(block.cosines)
-        scores = _scores(block.cosines, len(self._query.prompts), self._logit_scale)
-        best = scores.max(axis=1) if scores.shape[1] > 1 else scores[:, 0]
-        chosen = slice(None) if self._query.threshold is None else best >= self._query.threshold
-        end = self._kept + len(best[chosen])
-        self._points_m[self._kept : end], self._best[self._kept : end] = block.centers_m[chosen], best[chosen]
-        self._kept = end
-        # Voxels without an instance are counted for one before the first.
-        places, lengths = block.instances + 1, block.map_instances + 1
-        self._members += np.bincount(places, minlength=lengths)[1:]
-        for totals, column in zip(self._totals, scores.T, strict=True):
-            totals += np.bincount(places, column, minlength=lengths)[1:]
-
-    def points(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Centres and scores of the voxels that passed the threshold."""
-        return self._points_m[: self._kept], self._best[: self._kept]
-
-    def ranked(self, instances: InstanceSnapshot) -> list[RankedInstance]:
-        """The best instances of each prompt."""
-        rankable = np.flatnonzero((self._members > 0) & (instances.voxel_counts >= self._query.min_voxels))
-        ranked: list[tuple[float, int, int, RankedInstance]] = []
-        for order, (prompt, totals) in enumerate(zip(self._query.prompts, self._totals, strict=True)):
-            means = totals[rankable] / self._members[rankable]
-            # Rows are in ascending order of id, so a stable sort breaks ties by the lowest id.
-            for row in np.argsort(-means, kind="stable")[: self._query.top_k]:
-                score = float(means[row])
-                if self._query.threshold is None or score >= self._query.threshold:
-                    answer = _instance(instances, int(rankable[row]), prompt, score)
-                    ranked.append((-score, answer.id, order, answer))
-        return [entry[3] for entry in sorted(ranked, key=lambda entry: entry[:3])]
-
-
-def _scores(cosines: NDArray[np.float32], prompts: int, logit_scale: float) -> NDArray[np.float32]:
-    positive, negative = cosines[:, :prompts], cosines[:, prompts:]
-    if not negative.shape[1]:
-        return positive
-    # The smallest relevancy is that of the largest negative; the logistic function is its two-way softmax.
-    margin = logit_scale * (positive - negative.max(axis=1, keepdims=True)).astype(np.float64)
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * margin)), dtype=np.float32)
+def _ranked(query: TextQuery, found: Finding) -> list[RankedInstance]:
+    """The best instances of all prompts, merged."""
+    ranked: list[tuple[float, int, int, RankedInstance]] = []
+    for order, (prompt, (places, scores)) in enumerate(zip(query.prompts, found.best, strict=True)):
+        for place, score in zip(places.tolist(), scores.tolist(), strict=True):
+            if query.threshold is None or score >= query.threshold:
+                answer = _instance(found.instances, place, prompt, score)
+                ranked.append((-score, answer.id, order, answer))
+    return [entry[3] for entry in sorted(ranked, key=lambda entry: entry[:3])]
 
 
 def _instance(instances: InstanceSnapshot, row: int, prompt: str, score: float) -> RankedInstance:

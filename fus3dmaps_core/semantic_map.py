@@ -8,32 +8,22 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from dataclasses import fields
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from fus3dmaps_core.ahead import computed_ahead
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.kernels.protocols import Extents, Pairs, SlotBlock, VoxelBlock
+from fus3dmaps_core.kernels.protocols import Pairs, Texts
 from fus3dmaps_core.kernels.selection import select_kernels
 from fus3dmaps_core.layers.fusion import FusionInputs
-from fus3dmaps_core.layers.similarity import DenseCosines, FusedDenseCosines, InstanceCosines, LayerCosines
+from fus3dmaps_core.layers.similarity import LAYERS, layer_named
 from fus3dmaps_core.map_input import check_state, float_tensor, index_tensor, unit_rows, voxel_keys, weight_tensor
 from fus3dmaps_core.map_state import MapState
-from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, SimilarityBlock, VoxelSnapshot, snapshot_instances
-
-LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
-"""Names of the layers that can be queried."""
-
-_BLOCK_SLOTS = 32768  # Voxels that a query looks at together: a few megabytes of cosines and positions.
-_BLOCK_COSINES = 2**21
+from fus3dmaps_core.search import Finding, Question, Survey
+from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, VoxelSnapshot
 
 
 class SemanticMap:
@@ -110,7 +100,7 @@ class SemanticMap:
             MapError: A shape, dtype, range or value is wrong.
         """
         keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = unit_rows(embeddings, self.dimension, self._kernels, self._device)
+        unit = unit_rows("embeddings", embeddings, self.dimension, self._kernels, self._device)
         patch_index = index_tensor("patches", patches, len(points_m), len(embeddings), self._device)
         patch_weights = weight_tensor(weights, len(embeddings), self._device)
         if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
@@ -148,7 +138,7 @@ class SemanticMap:
             MapError: A shape, dtype, range or value is wrong.
         """
         keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = unit_rows(embeddings, self.dimension, self._kernels, self._device)
+        unit = unit_rows("embeddings", embeddings, self.dimension, self._kernels, self._device)
         proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
         if not len(keys):
             return np.full(len(embeddings), -1, np.int64)
@@ -243,32 +233,48 @@ class SemanticMap:
 
     def instances(self) -> InstanceSnapshot:
         """A copy of all instances alive."""
-        return self._visit(None, None)
+        with self._lock:
+            return Survey(self._state, self._kernels, self.config.voxel_size_m).instances()
 
-    def visit_similarity(
-        self, layer: str, texts: NDArray[np.float32], visit: Callable[[SimilarityBlock], None]
-    ) -> InstanceSnapshot:
-        """Hand out the cosines of a layer with texts, block by block, so that memory does not follow the map's size.
+    def search(
+        self,
+        layer: str,
+        prompts: NDArray[np.floating],
+        negatives: NDArray[np.floating] | None = None,
+        logit_scale: float = 1.0,
+        threshold: float | None = None,
+        top_k: int = 5,
+        min_voxels: int = 1,
+    ) -> Finding:
+        """Compare a layer with texts [sec: Implementation Details]. The map is not changed, and does not change meanwhile.
 
-        Without a window, fusion is that of the map as it is. The map does not change meanwhile.
+        Without a window, fusion is that of the map as it is. Memory beside the answer does not follow the map's size.
 
         Args:
             layer: One of LAYERS.
-            texts: (p, d) text embeddings, any length but 0.
-            visit: Called with some thousand voxels at a time, in the order of slots.
-
-        Returns:
-            The instances of the same moment.
+            prompts: (p, d) text embeddings, any length but 0.
+            negatives: (q, d) embeddings of what is not meant; with them a score is a probability, without them a cosine.
+            logit_scale: Factor of the cosines in that probability.
+            threshold: Voxels with a lower score are left out; None leaves none out.
+            top_k: At most this many instances per prompt.
+            min_voxels: Instances that occupy fewer voxels are not ranked.
 
         Raises:
-            QueryError: The layer is unknown.
+            QueryError: The layer is unknown, or there is no prompt.
             MapError: The texts have the wrong shape or are not finite.
         """
         if layer not in LAYERS:
             raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
-        unit = unit_rows(texts, self.dimension, self._kernels, self._device)
+        given = {"prompts": prompts} | ({} if negatives is None else {"negatives": negatives})
+        vectors = [unit_rows(name, each, self.dimension, self._kernels, self._device) for name, each in given.items()]
+        if not len(vectors[0]):
+            raise QueryError("prompts: at least one prompt is needed")
+        texts = Texts(torch.cat(vectors), len(vectors[0]), logit_scale)
         with self._lock:
-            return self._visit(self._cosines(layer, unit), visit, max(256, _BLOCK_COSINES // max(1, len(unit))))
+            inputs, fused = self._fusion_inputs(), self._state.fused
+            return Survey(self._state, self._kernels, self.config.voxel_size_m).search(
+                lambda texts: layer_named(layer, inputs, fused, texts), Question(texts, threshold, top_k, min_voxels)
+            )
 
     def export_state(self) -> dict[str, NDArray[Any]]:
         """Everything the map holds, as arrays by name: what a map file stores and what :meth:`import_state` reads.
@@ -296,48 +302,3 @@ class SemanticMap:
 
     def _fusion_inputs(self) -> FusionInputs:
         return FusionInputs(self._kernels, self._state.dense, self._state.instances, self.variance_ratio)
-
-    def _cosines(self, layer: str, unit: Tensor) -> LayerCosines:
-        if layer == "dense":
-            return DenseCosines(self._kernels, self._state.dense, unit)
-        if layer == "fused_dense":
-            return FusedDenseCosines(self._fusion_inputs(), unit)
-        fused = self._state.fused if layer == "fused_instances" else None
-        return InstanceCosines(self._fusion_inputs(), fused, unit, self._state.instances.live()[1])
-
-    def _visit(
-        self,
-        cosines: LayerCosines | None,
-        visit: Callable[[SimilarityBlock], None] | None,
-        block_slots: int = _BLOCK_SLOTS,
-    ) -> InstanceSnapshot:
-        """One pass over all voxels: what instances occupy, and the cosines of a layer."""
-        with self._lock:
-            state = self._state
-            ids, rows = state.instances.live()
-            extents = state.instances.extents()
-            place = torch.full((state.instances.pool.high_water + 1,), -1, dtype=torch.int64, device=self._device)
-            place[rows + 1] = torch.arange(len(rows), device=self._device)  # The first stays -1, for row -1.
-            step = min(block_slots, _BLOCK_SLOTS)
-            with_dense, with_instance = (False, False) if cosines is None else (cosines.with_dense, cosines.with_instance)
-
-            def survey(first: int) -> VoxelBlock:
-                slots = slice(first, min(first + step, state.hash.high_water))
-                block = SlotBlock(first, state.hash.keys(slots), state.dense.row_of_slot(slots), self.config.voxel_size_m)
-                return state.instances.survey(block, extents, with_dense, with_instance)
-
-            for picked in computed_ahead(partial(survey, first) for first in range(0, state.hash.high_water, step)):
-                if cosines is not None and visit is not None and len(picked.top_rows):
-                    values, owners = cosines(picked), place.index_select(0, picked.top_rows + 1)
-                    visit(
-                        SimilarityBlock(
-                            centers_m=picked.centers_m.cpu().numpy(),
-                            cosines=values.cpu().numpy(),
-                            instances=owners.cpu().numpy(),
-                            map_voxels=len(state.hash),
-                            map_instances=len(rows),
-                        )
-                    )
-            of_rows = Extents(*(getattr(extents, field.name)[rows] for field in fields(Extents)))
-            weights, hypotheses = state.instances.weights(rows), state.instances.voxels(rows)
-            return snapshot_instances(ids, weights, hypotheses, of_rows, self.config.voxel_size_m)

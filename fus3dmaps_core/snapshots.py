@@ -73,25 +73,6 @@ class InstanceSnapshot:
     boxes_max_m: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class SimilarityBlock:
-    """Similarities of some voxels of one layer with some texts.
-
-    Attributes:
-        centers_m: (n, 3) float32 voxel centres in the map frame, metres.
-        cosines: (n, p) float32.
-        instances: (n,) int64, place in the InstanceSnapshot of the instance that occupies the voxel, -1 without one.
-        map_voxels: Voxels of the map: more than this are not to come.
-        map_instances: Instances of the map.
-    """
-
-    centers_m: NDArray[np.float32]
-    cosines: NDArray[np.float32]
-    instances: NDArray[np.int64]
-    map_voxels: int
-    map_instances: int
-
-
 def snapshot_instances(
     ids: Tensor, weights: Tensor, hypothesis_voxels: Tensor, extents: Extents, voxel_size_m: float
 ) -> InstanceSnapshot:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.layers.similarity import LAYERS
+from fus3dmaps_core.semantic_map import SemanticMap
 
 
 def warm_up(dimension: int, config: MapConfig) -> None:
@@ -28,7 +29,8 @@ def warm_up(dimension: int, config: MapConfig) -> None:
             rehearsal.integrate_dense(points_m.astype(dtype), index, embeddings.astype(dtype), weights, colors)
         rehearsal.integrate_proposals(points_m, index, embeddings)
         for layer in LAYERS:
-            rehearsal.visit_similarity(layer, embeddings, lambda block: None)
+            for prompts in (embeddings, embeddings[:1]):
+                rehearsal.search(layer, prompts, embeddings)
         rehearsal.fuse()
         rehearsal.prune_window(points_m[0])
         rehearsal.remove_voxels(points_m)

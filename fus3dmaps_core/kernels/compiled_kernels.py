@@ -2,35 +2,41 @@
 
 from __future__ import annotations
 
-import itertools
+import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from fus3dmaps_core.kernels import numba_instances, numba_points, numba_rows
+from fus3dmaps_core.kernels import numba_cosines, numba_fusion, numba_instances, numba_points, numba_rows, numba_scan
 from fus3dmaps_core.kernels.keys import BITS, HALF
+from fus3dmaps_core.kernels.numba_values import FLOAT, stored
 from fus3dmaps_core.kernels.protocols import (
     DELETED,
     EMPTY,
     Association,
+    EmbeddedLayer,
     Extents,
+    Fusable,
     HashTable,
     Hypotheses,
+    InheritedLayer,
     Pairs,
+    ScoredVoxels,
+    ScoreSums,
     SlotBlock,
-    VoxelBlock,
 )
+from fus3dmaps_core.kernels.workers import Lanes, Workers, cuts
 from fus3dmaps_core.memory.rows import RowPool
+from fus3dmaps_core.memory.scratch import Scratch
 
-_KINDS = {torch.float32: numba_rows.FLOAT32, torch.float16: numba_rows.FLOAT16, torch.int8: numba_rows.INT8}
 _LANES = 2  # Fixed, so that sums over many voxels do not depend on the number of threads; each lane has sums of its own.
 _PART_VALUES = 256 * 1024  # Work of some 0.1 ms: less is not worth a second thread.
-_PARTS_PER_THREAD = 4
+_SCAN_SLOTS = 8192  # Of a scan, the same.
 
 
 class CompiledKernels:
@@ -38,7 +44,13 @@ class CompiledKernels:
 
     def __init__(self) -> None:
         """Compiles nothing yet: numba does at the first call of each loop, or takes it from its cache."""
-        self._executor: ThreadPoolExecutor | None = None
+        self._workers = Workers()
+        self._scratch = Scratch()
+
+    @property
+    def scratch_nbytes(self) -> int:
+        """Bytes that are kept for the next call."""
+        return self._scratch.nbytes
 
     def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
         """As the protocol says."""
@@ -95,7 +107,8 @@ class CompiledKernels:
     ) -> None:
         """As the protocol says."""
         arrays = (rows, old, new, seeds, groups.offsets, groups.partners, amounts, embeddings.contiguous())
-        self._share(numba_rows.merge_means, len(rows), pool.dimension, *_stored(pool), *(each.numpy() for each in arrays))
+        pooled = (*stored(pool), pool.scales[:].numpy())
+        self._share(numba_rows.merge_means, len(rows), pool.dimension, *pooled, *(each.numpy() for each in arrays))
 
     def integrate(
         self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
@@ -125,35 +138,62 @@ class CompiledKernels:
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
         """As the protocol says."""
-        rows, counts = np.empty(len(slots), np.int64), np.empty(len(slots), np.int64)
-        held = (hypotheses.held_row.numpy(), hypotheses.held_count.numpy(), hypotheses.id_of_row.numpy())
-        numba_instances.top_hypotheses(slots.numpy(), *held, rows, counts)
-        return torch.from_numpy(rows), torch.from_numpy(counts)
+        rows, counts = np.empty(len(slots), np.int32), np.empty(len(slots), np.int32)
+        numba_scan.top_hypotheses(slots.numpy(), *_held(hypotheses), rows, counts)
+        return torch.from_numpy(rows).to(torch.int64), torch.from_numpy(counts).to(torch.int64)
 
-    def survey(
-        self, block: SlotBlock, hypotheses: Hypotheses, extents: Extents, with_dense: bool, with_instance: bool
-    ) -> VoxelBlock:
+    def scan_limit(self, texts: int) -> int:
+        """As the protocol says: parts of a scan are small, so only the room for its result counts."""
+        return 2**20
+
+    def scan(
+        self,
+        block: SlotBlock,
+        hypotheses: Hypotheses,
+        extents: Extents,
+        layer: EmbeddedLayer | InheritedLayer | None,
+        sums: ScoreSums | None,
+        threshold: float,
+        room_for: ScoredVoxels,
+    ) -> tuple[int, int]:
         """As the protocol says."""
-        count = len(block.keys)
-        centers_m = np.empty((count, 3), np.float32)
-        dense_rows, top_rows, top_counts = (np.empty(count, np.int64) for _ in range(3))
-        held = (hypotheses.held_row, hypotheses.held_count, hypotheses.id_of_row)
-        occupied = (extents.voxels, extents.counts, extents.sums, extents.low, extents.high)
-        picked = numba_instances.survey(
-            block.first,
-            block.voxel_size_m,
-            BITS,
-            HALF,
-            with_dense,
-            with_instance,
-            *(each.numpy() for each in (block.keys, block.dense_rows, *held, *occupied)),
-            centers_m,
-            dense_rows,
-            top_rows,
-            top_counts,
-        )
-        arrays = (each[:picked] for each in (centers_m, dense_rows, top_rows, top_counts))
-        return VoxelBlock(*(torch.from_numpy(each) for each in arrays))
+        asked = _asked(layer)
+        slots, rows, sums_width = len(block.keys), len(hypotheses.id_of_row), 0 if sums is None else asked.prompts + 1
+        parts = cuts(slots, _SCAN_SLOTS)
+        found, kept = [0] * len(parts), [0] * len(parts)
+        voxels, held = (block.keys.numpy(), block.dense_rows.numpy()), _held(hypotheses)
+        known = [getattr(extents, each).numpy() for each in ("voxels", "counts", "sums", "low", "high")]
+        if sums is not None:
+            known += [sums.members.numpy(), sums.totals.numpy()]
+        else:
+            known += [np.empty(0, np.int64), np.empty((0, 0), np.int64)]
+        room_m, room = room_for.centers_m.numpy(), room_for.best.numpy()
+        adding = threading.Lock()
+
+        def look(number: int, first: int, last: int) -> None:
+            most, here = min(rows, last - first), slice(first, last)
+            with (
+                self._scratch.lend((rows,), np.int32) as part_of_row,
+                self._scratch.lend((most,), np.int32) as row_of_part,
+                self._scratch.lend((most, numba_scan.EXTENT_COLUMNS), np.int64) as part_extents,
+                self._scratch.lend((most, sums_width), np.int64) as part_sums,
+            ):
+                part_of_row.fill(-1)
+                table = (part_of_row, row_of_part, part_extents, part_sums)
+                numbers = (block.first + first, *(each[here] for each in voxels), block.voxel_size_m)
+                results = numba_scan.scan(*numbers, *held, *asked, threshold, *table, room_m[here], room[here])
+                used, found[number], kept[number] = results
+                with adding:
+                    numba_scan.add_parts(*(each[:used] for each in table[1:]), *known)
+
+        self._workers.run([partial(look, number, *part) for number, part in enumerate(parts)])
+        end = 0
+        for (first, _), count in zip(parts, kept, strict=True):
+            if first != end:
+                for array in (room_m, room):
+                    array[end : end + count] = array[first : first + count].copy()
+            end += count
+        return sum(found), end
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
         """As the protocol says."""
@@ -171,82 +211,99 @@ class CompiledKernels:
         """As the protocol says."""
         found = np.empty((len(rows), len(texts)), np.float32)
         arrays = (rows.numpy(), texts.contiguous().numpy(), found)
-        self._share(numba_rows.cosines, len(rows), pool.dimension, *_stored(pool), *arrays)
+        self._share(numba_cosines.cosines, len(rows), pool.dimension, *stored(pool), *arrays)
         return torch.from_numpy(found)
 
-    def fused_cosines(
-        self,
-        pool: RowPool,
-        rows: Tensor,
-        weights: Tensor,
-        own_pool: RowPool,
-        own_rows: Tensor,
-        own_weights: Tensor,
-        texts: Tensor,
-    ) -> Tensor:
+    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """As the protocol says."""
-        found = np.empty((len(rows), len(texts)), np.float32)
-        dense = (*_stored(pool), rows.numpy(), weights.numpy())
-        own = (own_pool.addresses, own_pool.block_rows, own_rows.numpy(), own_weights.numpy())
-        self._share(numba_rows.fused_cosines, len(rows), pool.dimension, *dense, *own, texts.contiguous().numpy(), found)
-        return torch.from_numpy(found)
+        pool, count = voxels.pool, len(rows)
+        place = np.full(own.high_water, -1, np.int32)
+        place[rows.numpy()] = np.arange(count, dtype=np.int32)
+        arrays = [each.numpy() for each in (voxels.slot_of_row, voxels.weight_of_row, voxels.held_row)]
+        totals, known = np.zeros((_LANES, count)), np.zeros((_LANES, count), np.bool_)
+        evidence = np.empty(count)
+        parts = min(count, voxels.held_row.shape[1] * pool.block_rows)
 
-    def weighted_sums(
-        self,
-        pool: RowPool,
-        slot_of_row: Tensor,
-        weight_of_row: Tensor,
-        held_row: Tensor,
-        place_of_instance: Tensor,
-        places: int,
-    ) -> tuple[Tensor, Tensor]:
-        """As the protocol says."""
-        arrays = [each.numpy() for each in (slot_of_row, weight_of_row, held_row, place_of_instance)]
-        sums = [np.zeros((places, pool.dimension)) for _ in range(_LANES)]
-        totals = [np.zeros(places) for _ in range(_LANES)]
+        blocks = -(-len(voxels.slot_of_row) // pool.block_rows)
+        lanes = Lanes(blocks, _LANES)
 
-        def add(lane: int) -> None:
-            numba_rows.weighted_sums(*_stored(pool), *arrays, lane, _LANES, sums[lane], totals[lane])
+        with self._scratch.lend((_LANES, count, pool.dimension), np.float64) as sums:
 
-        self._run([partial(add, lane) for lane in range(_LANES)])
-        for lane in range(1, _LANES):
-            sums[0] += sums[lane]
-            totals[0] += totals[lane]
-        return torch.from_numpy(sums[0]), torch.from_numpy(totals[0])
+            def add() -> None:
+                with self._scratch.lend((parts, pool.dimension), np.float32) as room:
+                    for lane, first, last in lanes:
+                        which = (first, last, _LANES, room, sums[lane], totals[lane], known[lane])
+                        numba_fusion.add_rows(*stored(pool), pool.scales[:].numpy(), *arrays, place, *which)
+
+            self._workers.run([add] * _LANES)
+            rest = (
+                rows.numpy(),
+                own.addresses,
+                amounts.numpy(),
+                target.addresses,
+                stored(target)[-1],
+                bars.numpy(),
+                evidence,
+            )
+            write = (sums, totals, known, *rest)
+            self._share(numba_fusion.write_fused, count, pool.dimension, *write)
+        return torch.from_numpy(evidence)
 
     def _share(self, loop: Callable[..., Any], count: int, width: int, *arguments: Any) -> list[Any]:
         """Run a loop over [0, count) in parts; returns what the parts return."""
-        parts = min(1 + count * width // _PART_VALUES, _PARTS_PER_THREAD * torch.get_num_threads())
-        cuts = [count * part // parts for part in range(parts + 1)]
-        return self._run([partial(loop, *arguments, start, stop) for start, stop in itertools.pairwise(cuts)])
-
-    def _run(self, tasks: list[Callable[[], Any]]) -> list[Any]:
-        """Run independent tasks on this thread and helpers; returns what they return, in order.
-
-        On a busy machine a helper may have to wait for a core longer than the whole work takes. So tasks are taken from a
-        common list, and this thread waits only for those that a helper has begun.
-        """
-        results: list[Any] = [None] * len(tasks)
-        waiting = iter(range(len(tasks)))  # Taking the next number is atomic.
-
-        def work() -> None:
-            for index in waiting:
-                results[index] = tasks[index]()
-
-        helpers = min(torch.get_num_threads(), len(tasks)) - 1
-        if helpers and self._executor is None:
-            self._executor = ThreadPoolExecutor(torch.get_num_threads() - 1, thread_name_prefix="map_kernels")
-        futures = [self._executor.submit(work) for _ in range(helpers)] if self._executor else []
-        work()
-        for future in futures:
-            if not future.cancel():
-                future.result()
-        return results
+        parts = cuts(count, _PART_VALUES // width)
+        return self._workers.run([partial(loop, *arguments, start, stop) for start, stop in parts])
 
 
 def _shift(table: HashTable) -> int:
     return 65 - len(table.keys).bit_length()
 
 
-def _stored(pool: RowPool) -> tuple[Any, ...]:
-    return _KINDS[pool.dtype], pool.addresses, pool.block_rows, pool.scales[:].numpy()
+def _held(hypotheses: Hypotheses) -> tuple[NDArray[Any], ...]:
+    return hypotheses.held_row.numpy(), hypotheses.held_count.numpy(), hypotheses.id_of_row.numpy()
+
+
+class _Asked(NamedTuple):
+    """A layer as the compiled scan takes it; what a layer does not have is empty."""
+
+    layer: int = numba_scan.NOTHING
+    tag: Any = FLOAT
+    size: int = 4
+    addresses: NDArray[np.int64] = np.empty(0, np.int64)
+    shift: int = 0
+    scales: NDArray[np.float32] = np.empty(0, np.float32)
+    weight_of_row: NDArray[np.float32] = np.empty(0, np.float32)
+    own_addresses: NDArray[np.int64] = np.empty(0, np.int64)
+    own_shift: int = 0
+    variance_ratio: np.float32 = np.float32(0)
+    texts: NDArray[np.float32] = np.empty((0, 0), np.float32)
+    prompts: int = 0
+    logit_scale: float = 0.0
+    scores_of_row: NDArray[np.float32] = np.empty((0, 0), np.float32)
+
+
+def _asked(layer: EmbeddedLayer | InheritedLayer | None) -> _Asked:
+    if layer is None:
+        return _Asked()
+    if isinstance(layer, InheritedLayer):
+        scores = layer.scores_of_row.numpy()
+        return _Asked(numba_scan.INSTANCES, prompts=scores.shape[1], scores_of_row=scores)
+    tag, size, addresses, shift = stored(layer.pool)
+    asked = _Asked(
+        numba_scan.DENSE,
+        tag,
+        size,
+        addresses,
+        shift,
+        layer.pool.scales[:].numpy(),
+        layer.weight_of_row.numpy(),
+        texts=layer.texts.vectors.contiguous().numpy(),
+        prompts=layer.texts.prompts,
+        logit_scale=layer.texts.logit_scale,
+    )
+    if layer.own is None:
+        return asked
+    own = stored(layer.own)
+    return asked._replace(
+        layer=numba_scan.FUSED, own_addresses=own[2], own_shift=own[3], variance_ratio=np.float32(layer.variance_ratio)
+    )

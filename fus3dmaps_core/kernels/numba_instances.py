@@ -1,7 +1,6 @@
-"""Compiled loops over proposals and hypotheses: association, counting and displacement, and the voxels' top hypotheses.
+"""Compiled loops over proposals and hypotheses: association, counting and displacement.
 
-Loops over all voxels index by unsigned numbers and name the axes one by one, which made them three times as fast. Nothing
-here depends on another compiled module, for numba's cache notices changes of the file itself only.
+Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
 """
 
 from __future__ import annotations
@@ -146,85 +145,3 @@ def integrate(
         for i in range(first_dead, died):
             id_of_row[dead[i]] = -1
     return created, died
-
-
-@njit(inline="always")
-def _top(
-    slot: np.uint64, held_row: NDArray[np.int32], held_count: NDArray[np.int32], id_of_row: NDArray[np.int64]
-) -> tuple[np.int32, np.int32]:
-    """Row with the highest count (ties: the lowest id; -1 without hypothesis) and that count."""
-    best_row, best_count = np.int32(-1), np.int32(0)
-    for k in range(np.uint64(held_row.shape[1])):
-        row, count = held_row[slot, k], held_count[slot, k]
-        if row < 0:
-            continue
-        is_first = best_row < 0 or count > best_count
-        if is_first or (count == best_count and id_of_row[np.uint32(row)] < id_of_row[np.uint32(best_row)]):
-            best_row, best_count = row, count
-    return best_row, best_count
-
-
-@njit(**_OPTIONS)
-def top_hypotheses(
-    slots: NDArray[np.int64],
-    held_row: NDArray[np.int32],
-    held_count: NDArray[np.int32],
-    id_of_row: NDArray[np.int64],
-    top_row: NDArray[np.int64],
-    top_count: NDArray[np.int64],
-) -> None:
-    """Write the top hypothesis of each slot."""
-    for i in range(len(slots)):
-        top_row[i], top_count[i] = _top(np.uint64(slots[i]), held_row, held_count, id_of_row)
-
-
-@njit(**_OPTIONS)
-def survey(
-    first: int,
-    voxel_size_m: float,
-    bits: int,
-    half: int,
-    with_dense: bool,
-    with_instance: bool,
-    keys: NDArray[np.int64],
-    dense_rows: NDArray[np.int32],
-    held_row: NDArray[np.int32],
-    held_count: NDArray[np.int32],
-    id_of_row: NDArray[np.int64],
-    voxels: NDArray[np.int64],
-    counts: NDArray[np.int64],
-    sums: NDArray[np.int64],
-    low: NDArray[np.int64],
-    high: NDArray[np.int64],
-    found_centers: NDArray[np.float32],
-    found_dense_rows: NDArray[np.int64],
-    found_top_rows: NDArray[np.int64],
-    found_top_counts: NDArray[np.int64],
-) -> np.int64:
-    """Add a block's voxels to what instances occupy and write down those that have a layer; returns how many do."""
-    mask, shift = np.int64((1 << bits) - 1), np.int64(bits)
-    found = np.uint64(0)
-    for i in range(len(keys)):
-        row, count = _top(np.uint64(first + i), held_row, held_count, id_of_row)
-        x = ((keys[i] >> (2 * shift)) & mask) - half
-        y = ((keys[i] >> shift) & mask) - half
-        z = (keys[i] & mask) - half
-        if row >= 0:
-            place, weight = np.uint32(row), np.int64(count)
-            voxels[place] += 1
-            counts[place] += weight
-            sums[place, 0] += weight * x
-            sums[place, 1] += weight * y
-            sums[place, 2] += weight * z
-            low[place, 0], high[place, 0] = min(low[place, 0], x), max(high[place, 0], x)
-            low[place, 1], high[place, 1] = min(low[place, 1], y), max(high[place, 1], y)
-            low[place, 2], high[place, 2] = min(low[place, 2], z), max(high[place, 2], z)
-        if (with_dense and dense_rows[i] >= 0) or (with_instance and row >= 0):
-            found_centers[found, 0] = np.float32((np.float64(x) + 0.5) * voxel_size_m)
-            found_centers[found, 1] = np.float32((np.float64(y) + 0.5) * voxel_size_m)
-            found_centers[found, 2] = np.float32((np.float64(z) + 0.5) * voxel_size_m)
-            found_dense_rows[found] = dense_rows[i]
-            found_top_rows[found] = row
-            found_top_counts[found] = count
-            found += np.uint64(1)
-    return np.int64(found)

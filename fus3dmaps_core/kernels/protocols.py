@@ -16,6 +16,9 @@ EMPTY, DELETED = -1, -2
 MAX_COUNT = 2**31 - 1
 """Counts of hypotheses stay here when they would grow beyond."""
 
+SCORE_UNIT = 2**30
+"""Scores are summed as integers of steps this small: whatever the order, the sum is the same, and 2^32 of them fit."""
+
 
 @dataclass(frozen=True)
 class HashTable:
@@ -103,20 +106,95 @@ class SlotBlock:
 
 
 @dataclass(frozen=True)
-class VoxelBlock:
-    """Some voxels of a block of slots.
+class Texts:
+    """What the voxels of a layer are compared with.
+
+    Without negatives a score is a cosine. With them it is the smallest over the negatives of
+    exp(s c) / (exp(s c) + exp(s c_negative)), s being the logit scale and c the cosines.
 
     Attributes:
-        centers_m: (n, 3) float32.
-        dense_rows: (n,) int64, -1 for none.
-        top_rows: (n,) int64 instance row of the top hypothesis, -1 for none.
-        top_counts: (n,) int64 its count.
+        vectors: (p + q, d) float32 unit vectors: prompts, then negatives.
+        prompts: p, at least 1.
+        logit_scale: s.
+    """
+
+    vectors: Tensor
+    prompts: int
+    logit_scale: float
+
+
+@dataclass(frozen=True)
+class EmbeddedLayer:
+    """A layer whose voxels have an embedding of their own: f_i, or (w_i f_i + lambda c_i g) / (w_i + lambda c_i).
+
+    Attributes:
+        pool: Rows of the f_i.
+        weight_of_row: (rows,) float32 w of each row.
+        own: Rows (float32) of instances: g is that of the top hypothesis and c_i its count; voxels with either have the
+            layer. None for the f_i alone.
+        variance_ratio: lambda.
+        texts: What voxels are compared with.
+    """
+
+    pool: RowPool
+    weight_of_row: Tensor
+    own: RowPool | None
+    variance_ratio: float
+    texts: Texts
+
+
+@dataclass(frozen=True)
+class InheritedLayer:
+    """A layer whose voxels have the embedding of their top hypothesis.
+
+    Attributes:
+        scores_of_row: (instance rows, p) float32 score of each instance with each prompt.
+    """
+
+    scores_of_row: Tensor
+
+
+@dataclass(frozen=True)
+class ScoreSums:
+    """Scores of the voxels whose top hypothesis an instance is, by its row.
+
+    Attributes:
+        members: (rows,) int64, how many of these voxels have the layer.
+        totals: (rows, p) int64, sum of their scores in steps of 1 / SCORE_UNIT.
+    """
+
+    members: Tensor
+    totals: Tensor
+
+
+@dataclass(frozen=True)
+class ScoredVoxels:
+    """Room for voxels and their scores.
+
+    Attributes:
+        centers_m: (n, 3) float32, metres.
+        best: (n,) float32 best score over the prompts.
     """
 
     centers_m: Tensor
-    dense_rows: Tensor
-    top_rows: Tensor
-    top_counts: Tensor
+    best: Tensor
+
+
+@dataclass(frozen=True)
+class Fusable:
+    """What the fusion of instances with their voxels reads, beside their own embeddings.
+
+    Attributes:
+        pool: Rows f of the dense layer.
+        slot_of_row: (rows,) int32 slot of each row, -1 for a free one.
+        weight_of_row: (rows,) float32 w.
+        held_row: (slots, K) int32 instances that each slot holds, -1 where empty.
+    """
+
+    pool: RowPool
+    slot_of_row: Tensor
+    weight_of_row: Tensor
+    held_row: Tensor
 
 
 @dataclass(frozen=True)
@@ -219,20 +297,34 @@ class Kernels(Protocol):
         """Per slot the row with the highest count (ties: the lowest id; -1 without one) and that count: (n,) int64."""
         ...
 
-    def survey(
-        self, block: SlotBlock, hypotheses: Hypotheses, extents: Extents, with_dense: bool, with_instance: bool
-    ) -> VoxelBlock:
-        """Look at a block of slots once: add its voxels to what instances occupy, and pick those that have a layer.
+    def scan_limit(self, texts: int) -> int:
+        """How many slots a scan may be given at a time, compared with so many texts, for its memory to stay small."""
+        ...
+
+    def scan(
+        self,
+        block: SlotBlock,
+        hypotheses: Hypotheses,
+        extents: Extents,
+        layer: EmbeddedLayer | InheritedLayer | None,
+        sums: ScoreSums | None,
+        threshold: float,
+        room_for: ScoredVoxels,
+    ) -> tuple[int, int]:
+        """Look at a block of slots once: what instances occupy, and how its voxels compare with texts.
 
         Args:
             block: The slots.
             hypotheses: Of all slots.
             extents: Changed, by every voxel of the block that has a hypothesis.
-            with_dense: Pick voxels that have a dense embedding.
-            with_instance: Pick voxels that have a hypothesis.
+            layer: What is compared; None for nothing.
+            sums: Changed, by the voxels that have the layer; only without a layer None.
+            threshold: Voxels that score less are not written; -inf for none.
+            room_for: Written from the front, in the order of slots, its rest left undefined; with a layer as long as the
+                block.
 
         Returns:
-            The voxels picked, in the order of slots.
+            How many voxels have the layer, and how many were written.
         """
         ...
 
@@ -248,39 +340,20 @@ class Kernels(Protocol):
         """Cosines of the rows with unit vectors (p, d): (n, p) float32."""
         ...
 
-    def fused_cosines(
-        self,
-        pool: RowPool,
-        rows: Tensor,
-        weights: Tensor,
-        own_pool: RowPool,
-        own_rows: Tensor,
-        own_weights: Tensor,
-        texts: Tensor,
-    ) -> Tensor:
-        """Cosines of (weights rows + own_weights own_rows) with unit vectors (p, d): (n, p) float32; row -1 adds nothing."""
-        ...
+    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
+        """Fuse instances: target[row] <- (sum of w f over the voxels that hold it + amount own[row]) / evidence.
 
-    def weighted_sums(
-        self,
-        pool: RowPool,
-        slot_of_row: Tensor,
-        weight_of_row: Tensor,
-        held_row: Tensor,
-        place_of_instance: Tensor,
-        places: int,
-    ) -> tuple[Tensor, Tensor]:
-        """Sums over instances' voxels of w f and of w, in one pass over the rows.
+        The evidence is the sum of w over these voxels, plus the amount. Where it is 0, own[row] is what is written.
 
         Args:
-            pool: The rows.
-            slot_of_row: (rows,) int32 slot of each row, -1 for a free one.
-            weight_of_row: (rows,) float32 w.
-            held_row: (slots, K) int32 instances that each slot holds, -1 where empty.
-            place_of_instance: (instance rows,) int32, which sum an instance's voxels go to, -1 for none.
-            places: Number of sums.
+            voxels: What instances are fused with.
+            rows: (n,) int64 distinct rows of the instances. What comes out for one does not depend on the others.
+            own: Their own embeddings, float32.
+            amounts: (n,) float64 weight of these.
+            bars: (n,) float64; a row is written only where its evidence is greater.
+            target: The rows that are written, float32.
 
         Returns:
-            (places, d) float64 and (places,) float64. An instance's sums depend on its own voxels alone, bit for bit.
+            (n,) float64 evidence.
         """
         ...

@@ -13,14 +13,20 @@ from fus3dmaps_core.kernels.protocols import (
     DELETED,
     EMPTY,
     MAX_COUNT,
+    SCORE_UNIT,
     Association,
+    EmbeddedLayer,
     Extents,
+    Fusable,
     HashTable,
     Hypotheses,
+    InheritedLayer,
     Pairs,
+    ScoredVoxels,
+    ScoreSums,
     SlotBlock,
-    VoxelBlock,
 )
+from fus3dmaps_core.kernels.scores import scores_of
 from fus3dmaps_core.memory.rows import RowPool
 
 _COUNT_UNIT = 2**32  # Orders by count first, then by id, in one integer.
@@ -148,24 +154,46 @@ class TorchKernels:
         column = torch.argmax(counts * _COUNT_UNIT - hypotheses.id_of_row[rows.clamp(min=0)], dim=1, keepdim=True)
         return rows.gather(1, column).squeeze(1), counts.gather(1, column).squeeze(1)
 
-    def survey(
-        self, block: SlotBlock, hypotheses: Hypotheses, extents: Extents, with_dense: bool, with_instance: bool
-    ) -> VoxelBlock:
+    def scan_limit(self, texts: int) -> int:
+        """As the protocol says."""
+        return min(2**17, max(256, 2**20 // max(texts, 1)))
+
+    def scan(
+        self,
+        block: SlotBlock,
+        hypotheses: Hypotheses,
+        extents: Extents,
+        layer: EmbeddedLayer | InheritedLayer | None,
+        sums: ScoreSums | None,
+        threshold: float,
+        room_for: ScoredVoxels,
+    ) -> tuple[int, int]:
         """As the protocol says."""
         slots = torch.arange(block.first, block.first + len(block.keys), device=block.keys.device)
         top_rows, top_counts = self.top_hypotheses(hypotheses, slots)
         owned = top_rows >= 0
-        rows, counts, coordinates = top_rows[owned], top_counts[owned], unpack(block.keys[owned])
-        extents.voxels.index_add_(0, rows, torch.ones_like(rows))
-        extents.counts.index_add_(0, rows, counts)
-        extents.sums.index_add_(0, rows, counts[:, None] * coordinates)
-        by_axis = rows[:, None].expand(-1, 3)
-        extents.low.scatter_reduce_(0, by_axis, coordinates, "amin")
-        extents.high.scatter_reduce_(0, by_axis, coordinates, "amax")
+        _add_extents(extents, top_rows[owned], top_counts[owned], unpack(block.keys[owned]))
+        if layer is None:
+            return 0, 0
         dense_rows = block.dense_rows.to(torch.int64)
-        picked = ((dense_rows >= 0) & with_dense) | (owned & with_instance)
-        centers_m = self.centers(block.keys[picked], block.voxel_size_m)
-        return VoxelBlock(centers_m, dense_rows[picked], top_rows[picked], top_counts[picked])
+        if isinstance(layer, InheritedLayer):
+            picked = torch.nonzero(owned).squeeze(1)
+            scores = layer.scores_of_row[top_rows[picked]]
+        else:
+            picked = torch.nonzero((dense_rows >= 0) | (owned & (layer.own is not None))).squeeze(1)
+            scores = self._scores(layer, dense_rows[picked], top_rows[picked], top_counts[picked])
+        if sums is not None:
+            rows = top_rows[picked]
+            belong = rows >= 0
+            rows = rows[belong]
+            sums.members.index_add_(0, rows, torch.ones_like(rows))
+            sums.totals.index_add_(0, rows, (scores[belong] * SCORE_UNIT).to(torch.int64))
+        best = scores.amax(dim=1) if len(scores) else scores.new_zeros(0)
+        kept = best >= threshold
+        count = int(kept.sum())
+        room_for.best[:count] = best[kept]
+        room_for.centers_m[:count] = self.centers(block.keys[picked[kept]], block.voxel_size_m)
+        return len(picked), count
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
         """As the protocol says."""
@@ -184,61 +212,81 @@ class TorchKernels:
             found[part] = normalize(pool.read(rows[part]), dim=1) @ texts.T
         return found
 
-    def fused_cosines(
-        self,
-        pool: RowPool,
-        rows: Tensor,
-        weights: Tensor,
-        own_pool: RowPool,
-        own_rows: Tensor,
-        own_weights: Tensor,
-        texts: Tensor,
-    ) -> Tensor:
+    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """As the protocol says."""
-        found = texts.new_empty((len(rows), len(texts)))
-        for start in range(0, len(rows), _READ_ROWS):
-            part = slice(start, start + _READ_ROWS)
-            fused = texts.new_zeros((len(rows[part]), texts.shape[1]))
-            dense_rows, dense_weights = rows[part], weights[part]
-            instance_rows, instance_weights = own_rows[part], own_weights[part]
-            total = dense_weights + instance_weights
-            shares = torch.where(instance_rows < 0, 1.0, dense_weights / total)
-            rests = torch.where(dense_rows < 0, 1.0, instance_weights / total)
-            for source, where, share in ((pool, dense_rows, shares), (own_pool, instance_rows, rests)):
-                used = where >= 0
-                fused[used] += source.read(where[used]) * share[used, None]
-            found[part] = normalize(fused, dim=1) @ texts.T
-        return found
+        place = torch.full((own.high_water,), -1, dtype=torch.int64, device=rows.device)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        sums, evidence = _weighted_sums(voxels, place, len(rows))
+        evidence += amounts
+        for part in torch.split(torch.arange(len(rows), device=rows.device), _READ_ROWS):
+            part = part[evidence[part] > bars[part]]
+            total, means = evidence[part, None], own.read(rows[part])
+            fused = sums[part].addcmul_(means.to(torch.float64), amounts[part, None]).div_(total)
+            # Without lambda and dense evidence an instance has nothing to be fused from and keeps its own embedding.
+            target.write(rows[part], torch.where(total > 0, fused.to(torch.float32), means))
+        return evidence
 
-    def weighted_sums(
-        self,
-        pool: RowPool,
-        slot_of_row: Tensor,
-        weight_of_row: Tensor,
-        held_row: Tensor,
-        place_of_instance: Tensor,
-        places: int,
-    ) -> tuple[Tensor, Tensor]:
-        """As the protocol says."""
-        sums = torch.zeros((places, pool.dimension), dtype=torch.float64, device=slot_of_row.device)
-        totals = torch.zeros(places, dtype=torch.float64, device=slot_of_row.device)
-        for first in range(0, len(slot_of_row), pool.block_rows):
-            slots = slot_of_row[first : first + pool.block_rows].to(torch.int64)
-            held = torch.where((slots >= 0)[:, None], held_row[slots.clamp(min=0)], -1).to(torch.int64)
-            place = torch.where(held >= 0, place_of_instance[held.clamp(min=0)], -1)
-            row, column = torch.nonzero(place >= 0, as_tuple=True)
-            if not len(row):
-                continue
-            owners, order = torch.sort(place[row, column].to(torch.int64), stable=True)
-            touched, lengths = torch.unique_consecutive(owners, return_counts=True)
-            # Only the rows that someone asks for are decoded.
-            wanted, row = torch.unique(row[order], return_inverse=True)
-            weights = weight_of_row[first + wanted][row]
-            bags = torch.cumsum(lengths, 0) - lengths
-            means = pool.read(first + wanted)
-            sums[touched] += embedding_bag(row, means, bags, mode="sum", per_sample_weights=weights).to(torch.float64)
-            totals[touched] += torch.segment_reduce(weights.to(torch.float64), "sum", lengths=lengths)
-        return sums, totals
+    def _scores(self, layer: EmbeddedLayer, dense_rows: Tensor, top_rows: Tensor, top_counts: Tensor) -> Tensor:
+        """Scores (n, p) of voxels that have the layer."""
+        vectors = layer.texts.vectors
+        found = vectors.new_empty((len(dense_rows), len(vectors)))
+        for start in range(0, len(dense_rows), _READ_ROWS):
+            part = slice(start, start + _READ_ROWS)
+            rows = dense_rows[part]
+            if layer.own is None:
+                means = layer.pool.read(rows)
+            else:
+                means = _fused_means(layer, layer.own, rows, top_rows[part], top_counts[part])
+            found[part] = normalize(means, dim=1) @ vectors.T
+        return scores_of(found, layer.texts)
+
+
+def _add_extents(extents: Extents, rows: Tensor, counts: Tensor, coordinates: Tensor) -> None:
+    extents.voxels.index_add_(0, rows, torch.ones_like(rows))
+    extents.counts.index_add_(0, rows, counts)
+    extents.sums.index_add_(0, rows, counts[:, None] * coordinates)
+    by_axis = rows[:, None].expand(-1, 3)
+    extents.low.scatter_reduce_(0, by_axis, coordinates, "amin")
+    extents.high.scatter_reduce_(0, by_axis, coordinates, "amax")
+
+
+def _fused_means(layer: EmbeddedLayer, own: RowPool, rows: Tensor, top_rows: Tensor, top_counts: Tensor) -> Tensor:
+    """(w f + lambda c g) / (w + lambda c) of voxels with a row, a top hypothesis or both: (n, d) float32."""
+    known, held = rows >= 0, top_rows >= 0
+    weights = layer.weight_of_row.new_zeros(len(rows))
+    weights[known] = layer.weight_of_row[rows[known]]
+    own_weights = layer.variance_ratio * top_counts.to(torch.float32)
+    total = weights + own_weights
+    shares = torch.where(held, weights / total, 1.0)
+    rests = torch.where(known, own_weights / total, 1.0)
+    fused = layer.texts.vectors.new_zeros((len(rows), own.dimension))
+    for pool, where, used, share in ((layer.pool, rows, known, shares), (own, top_rows, held, rests)):
+        fused[used] += pool.read(where[used]) * share[used, None]
+    return fused
+
+
+def _weighted_sums(voxels: Fusable, place_of_instance: Tensor, places: int) -> tuple[Tensor, Tensor]:
+    """Sums over instances' voxels of w f, (places, d) float64, and of w, (places,) float64."""
+    pool, slot_of_row = voxels.pool, voxels.slot_of_row
+    sums = torch.zeros((places, pool.dimension), dtype=torch.float64, device=slot_of_row.device)
+    totals = torch.zeros(places, dtype=torch.float64, device=slot_of_row.device)
+    for first in range(0, len(slot_of_row), pool.block_rows):
+        slots = slot_of_row[first : first + pool.block_rows].to(torch.int64)
+        held = torch.where((slots >= 0)[:, None], voxels.held_row[slots.clamp(min=0)], -1).to(torch.int64)
+        place = torch.where(held >= 0, place_of_instance[held.clamp(min=0)], -1)
+        row, column = torch.nonzero(place >= 0, as_tuple=True)
+        if not len(row):
+            continue
+        owners, order = torch.sort(place[row, column], stable=True)
+        touched, lengths = torch.unique_consecutive(owners, return_counts=True)
+        # Only the rows that someone asks for are decoded.
+        wanted, row = torch.unique(row[order], return_inverse=True)
+        weights = voxels.weight_of_row[first + wanted][row]
+        bags = torch.cumsum(lengths, 0) - lengths
+        means = pool.read(first + wanted)
+        sums[touched] += embedding_bag(row, means, bags, mode="sum", per_sample_weights=weights).to(torch.float64)
+        totals[touched] += torch.segment_reduce(weights.to(torch.float64), "sum", lengths=lengths)
+    return sums, totals
 
 
 def _best_match(hypotheses: Hypotheses, held: Tensor, size: int, iou_threshold: float) -> int | None:

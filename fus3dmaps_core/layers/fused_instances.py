@@ -10,8 +10,8 @@ from fus3dmaps_core.layers.instances import InstanceLayer
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rows import RowPool
 
-_FUSE_SUM_BYTES = 24 * 2**20  # Below what malloc hands back to the system, which costs as much as the sums themselves.
-_QUERY_SUM_BYTES = 4 * 2**20
+_FUSE_SUM_BYTES, _QUERY_SUM_BYTES = 8 * 2**20, 4 * 2**20
+_COPIED_ROWS = 128
 
 
 class FusedInstances:
@@ -65,19 +65,16 @@ class FusedInstances:
         if not self._windowed:
             self._refresh(inputs, rows, _FUSE_SUM_BYTES)
             pending = torch.nonzero(self._unstored[: instances.pool.high_water]).squeeze(1)
-            for part in torch.split(pending, 1024):
+            for part in torch.split(pending, _COPIED_ROWS):
                 self._stored.write(part, self._current.read(part))
-                self._evidence[part] = self._current_evidence[part]
-                self._unstored[part] = False
+            self._evidence[pending] = self._current_evidence[pending]
+            self._unstored[pending] = False
             return len(alive), len(rows)
-        updated = 0
-        for part, fused, evidence in fuse_instances(inputs, rows, _FUSE_SUM_BYTES):
-            better = evidence > self._evidence[part]
-            self._stored.write(part[better], fused[better])
-            self._evidence[part[better]] = evidence[better]
-            updated += int(better.sum())
+        before = self._evidence[rows]
+        evidence = fuse_instances(inputs, rows, before, self._stored, _FUSE_SUM_BYTES)
+        self._evidence[rows] = torch.maximum(before, evidence)
         instances.settle(rows)
-        return updated, len(rows)
+        return int((evidence > before).sum()), len(rows)
 
     def restore(self, rows: Tensor, fused: Tensor, evidence: Tensor) -> None:
         """Store fused embeddings (n, d) and evidence (n,), 0 for none."""
@@ -96,15 +93,16 @@ class FusedInstances:
         values[fused] = self._stored.read(rows[fused])
         return values
 
-    def cosines(self, inputs: FusionInputs, rows: Tensor, texts: Tensor) -> Tensor:
-        """Cosines of the fused embeddings that a query sees with unit vectors (p, d): (n, p) float32."""
-        if not self._windowed:
-            self._refresh(inputs, inputs.instances.changed(), _QUERY_SUM_BYTES)
-            return inputs.kernels.cosines(self._current, rows, texts)
-        fused = self._evidence[rows] > 0
-        found = inputs.kernels.cosines(inputs.instances.pool, rows, texts)
-        found[fused] = inputs.kernels.cosines(self._stored, rows[fused], texts)
-        return found
+    def refreshed(self, inputs: FusionInputs) -> RowPool:
+        """The fused embeddings that a query sees, where :meth:`are_fused` says so."""
+        if self._windowed:
+            return self._stored
+        self._refresh(inputs, inputs.instances.changed(), _QUERY_SUM_BYTES)
+        return self._current
+
+    def are_fused(self, rows: Tensor) -> Tensor:
+        """Which instances have a fused embedding; with a window, none before their first fusion: (n,) bool."""
+        return self._evidence[rows] > 0 if self._windowed else torch.ones_like(rows, dtype=torch.bool)
 
     @property
     def nbytes(self) -> int:
@@ -113,8 +111,7 @@ class FusedInstances:
         return self._stored.nbytes + self._current.nbytes + sum(column.nbytes for column in columns)
 
     def _refresh(self, inputs: FusionInputs, rows: Tensor, sum_bytes: int) -> None:
-        for part, fused, evidence in fuse_instances(inputs, rows, sum_bytes):
-            self._current.write(part, fused)
-            self._current_evidence[part] = evidence
-            self._unstored[part] = True
+        always = torch.full((len(rows),), -torch.inf, dtype=torch.float64, device=rows.device)
+        self._current_evidence[rows] = fuse_instances(inputs, rows, always, self._current, sum_bytes)
+        self._unstored[rows] = True
         inputs.instances.settle(rows)

@@ -10,15 +10,15 @@ The counts of an instance are summed as they come, so only voxels with a dense e
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from fus3dmaps_core.kernels.protocols import Kernels
+from fus3dmaps_core.kernels.protocols import Fusable, Kernels
 from fus3dmaps_core.layers.dense import DenseLayer
 from fus3dmaps_core.layers.instances import InstanceLayer
+from fus3dmaps_core.memory.rows import RowPool
 
 
 @dataclass(frozen=True)
@@ -38,30 +38,26 @@ class FusionInputs:
     variance_ratio: float
 
 
-def fuse_instances(inputs: FusionInputs, rows: Tensor, sum_bytes: int) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+def fuse_instances(inputs: FusionInputs, rows: Tensor, bars: Tensor, target: RowPool, sum_bytes: int) -> Tensor:
     """Fuse instances; what comes out for one does not depend on which others are asked for.
 
     Args:
         inputs: What is fused.
         rows: (n,) rows of the instances.
+        bars: (n,) float64; an instance's fused embedding is written only where its evidence is greater.
+        target: Written: fused embeddings, under the instances' rows.
         sum_bytes: Bytes of one set of float64 sums, of which kernels hold a few. As many instances as fit into one are
             fused in one pass over the dense rows.
 
-    Yields:
-        Rows (m,), their fused embeddings (m, d) float32 and evidence (m,) float64.
+    Returns:
+        Evidence e_id of each instance, (n,) float64.
     """
-    if not len(rows):
-        return
     dense, instances = inputs.dense, inputs.instances
-    for part in torch.split(rows, max(1, sum_bytes // (8 * instances.pool.dimension))):
-        place = torch.full((instances.pool.high_water,), -1, dtype=torch.int32, device=rows.device)
-        place.index_copy_(0, part, torch.arange(len(part), dtype=torch.int32, device=rows.device))
-        sums, evidence = inputs.kernels.weighted_sums(
-            dense.pool, dense.slot_of_row(), dense.weight_of_row(), instances.held(), place, len(part)
-        )
-        own = instances.pool.read(part)
-        scaled = inputs.variance_ratio * instances.observations(part).to(torch.float64)
-        evidence += scaled
-        sums.addcmul_(own.to(torch.float64), scaled[:, None]).div_(evidence[:, None])
-        # Without lambda and dense evidence an instance has nothing to be fused from and keeps its own embedding.
-        yield part, torch.where(evidence[:, None] > 0, sums.to(torch.float32), own), evidence
+    voxels = Fusable(dense.pool, dense.slot_of_row(), dense.weight_of_row(), instances.held())
+    amounts = inputs.variance_ratio * instances.observations(rows).to(torch.float64)
+    evidence = torch.empty_like(amounts)
+    step = max(1, sum_bytes // (8 * instances.pool.dimension))
+    for first in range(0, len(rows), step):
+        part = slice(first, first + step)
+        evidence[part] = inputs.kernels.fuse(voxels, rows[part], instances.pool, amounts[part], bars[part], target)
+    return evidence

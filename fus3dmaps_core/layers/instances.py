@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.kernels.protocols import Extents, Hypotheses, Kernels, Pairs, SlotBlock, VoxelBlock
+from fus3dmaps_core.kernels.protocols import Extents, Hypotheses, Kernels, Pairs
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rows import RowPool
 
@@ -72,11 +72,19 @@ class InstanceLayer:
 
     def top(self, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Per slot the row with the highest count (ties: the lowest id; -1 without any) and that count: (n,) int64."""
-        return self._kernels.top_hypotheses(self._columns(), slots)
+        return self._kernels.top_hypotheses(self.columns(), slots)
 
-    def survey(self, block: SlotBlock, extents: Extents, with_dense: bool, with_instance: bool) -> VoxelBlock:
-        """Add a block's voxels to what instances occupy and pick those that have a layer, as the kernels' protocol says."""
-        return self._kernels.survey(block, self._columns(), extents, with_dense, with_instance)
+    def columns(self) -> Hypotheses:
+        """What kernels work on, not a copy."""
+        rows = slice(0, self.pool.high_water)
+        return Hypotheses(
+            self._held_row[:],
+            self._held_count[:],
+            self._id_of_row[rows],
+            self._voxels_of_row[rows],
+            self._observations_of_row[rows],
+            self._changed[rows],
+        )
 
     def weights(self, rows: Tensor) -> Tensor:
         """Weight w_id: (n,) float64."""
@@ -129,7 +137,7 @@ class InstanceLayer:
         """
         spare = self.pool.allocate(len(embeddings))
         self._reserve_rows()
-        outcome = self._kernels.integrate(self._columns(), proposals, spare, self.next_id, self._iou_threshold)
+        outcome = self._kernels.integrate(self.columns(), proposals, spare, self.next_id, self._iou_threshold)
         self._average(outcome.rows, proposals, embeddings)
         self.next_id += outcome.created
         self.pool.free(spare[outcome.created :])
@@ -204,17 +212,6 @@ class InstanceLayer:
     def _reserve_rows(self) -> None:
         for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
             column.reserve(self.pool.high_water)
-
-    def _columns(self) -> Hypotheses:
-        rows = slice(0, self.pool.high_water)
-        return Hypotheses(
-            self._held_row[:],
-            self._held_count[:],
-            self._id_of_row[rows],
-            self._voxels_of_row[rows],
-            self._observations_of_row[rows],
-            self._changed[rows],
-        )
 
     def _average(self, rows: Tensor, proposals: Pairs, embeddings: Tensor) -> None:
         """f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the proposals given to an instance."""

@@ -1,84 +1,52 @@
-"""Cosines of texts with one layer, for some voxels at a time, so that memory stays bounded at any map size."""
+"""The layers that can be asked, as kernels compare them with texts."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from fus3dmaps_core.kernels.protocols import Kernels, VoxelBlock
-from fus3dmaps_core.layers.dense import DenseLayer
+from fus3dmaps_core.kernels.protocols import EmbeddedLayer, InheritedLayer, Texts
+from fus3dmaps_core.kernels.scores import scores_of
 from fus3dmaps_core.layers.fused_instances import FusedInstances
 from fus3dmaps_core.layers.fusion import FusionInputs
 
+LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
+"""Names of the layers that can be queried."""
 
-class LayerCosines(Protocol):
-    """Cosines of one layer with the texts that it was made for.
+_BLOCK_COSINES = 2**18  # Cosines of instances that are computed together: a megabyte.
 
-    Attributes:
-        with_dense: Whether voxels that have a dense embedding have this layer.
-        with_instance: Whether voxels that have a hypothesis have this layer.
+
+def layer_named(name: str, inputs: FusionInputs, fused: FusedInstances, texts: Texts) -> EmbeddedLayer | InheritedLayer:
+    """A layer and what it is compared with.
+
+    Dense: the voxels that have an embedding. Fused dense: those that have either layer,
+    f_fused,i = (w_i^D f_i^D + lambda c_i f_top(i)) / (w_i^D + lambda c_i), where c_i is the count of the top hypothesis.
+    Instances: per voxel the embedding of its top hypothesis, raw or fused.
+
+    Args:
+        name: One of LAYERS.
+        inputs: The layers of the map.
+        fused: Fused embeddings of the instances, which are brought up to date where a query sees them so.
+        texts: What the layer is compared with.
     """
-
-    with_dense: bool
-    with_instance: bool
-
-    def __call__(self, voxels: VoxelBlock) -> Tensor:
-        """Cosines of n voxels that have the layer: (n, p) float32."""
-        ...
+    if name in ("dense", "fused_dense"):
+        own = inputs.instances.pool if name == "fused_dense" else None
+        return EmbeddedLayer(inputs.dense.pool, inputs.dense.weight_of_row(), own, inputs.variance_ratio, texts)
+    return InheritedLayer(_instance_scores(inputs, fused if name == "fused_instances" else None, texts))
 
 
-class DenseCosines:
-    """The dense layer."""
-
-    with_dense, with_instance = True, False
-
-    def __init__(self, kernels: Kernels, dense: DenseLayer, texts: Tensor) -> None:
-        """For texts (p, d) of unit length."""
-        self._kernels, self._dense, self._texts = kernels, dense, texts
-
-    def __call__(self, voxels: VoxelBlock) -> Tensor:
-        """As the protocol says."""
-        return self._kernels.cosines(self._dense.pool, voxels.dense_rows, self._texts)
-
-
-class FusedDenseCosines:
-    """The fused dense layer, which covers every voxel that has either layer.
-
-    f_fused,i = (w_i^D f_i^D + lambda c_i f_top(i)) / (w_i^D + lambda c_i), where c_i is the count of the top hypothesis; a
-    voxel with one layer only takes that layer's embedding.
-    """
-
-    with_dense, with_instance = True, True
-
-    def __init__(self, inputs: FusionInputs, texts: Tensor) -> None:
-        """For texts (p, d) of unit length."""
-        self._inputs, self._texts = inputs, texts
-
-    def __call__(self, voxels: VoxelBlock) -> Tensor:
-        """As the protocol says."""
-        dense, rows = self._inputs.dense, voxels.dense_rows
-        own_weights = self._inputs.variance_ratio * voxels.top_counts.to(torch.float32)
-        own = (self._inputs.instances.pool, voxels.top_rows, own_weights)
-        return self._inputs.kernels.fused_cosines(dense.pool, rows, dense.weights(rows), *own, self._texts)
-
-
-class InstanceCosines:
-    """An instance layer: per voxel the embedding of its top hypothesis, raw or fused."""
-
-    with_dense, with_instance = False, True
-
-    def __init__(self, inputs: FusionInputs, fused: FusedInstances | None, texts: Tensor, instance_rows: Tensor) -> None:
-        """For texts (p, d) of unit length and the rows of all instances alive; raw without ``fused``."""
-        if fused is None:
-            cosines = inputs.kernels.cosines(inputs.instances.pool, instance_rows, texts)
+def _instance_scores(inputs: FusionInputs, fused: FusedInstances | None, texts: Texts) -> Tensor:
+    """Scores of all instances alive by their row, (rows, p) float32; of their own embeddings without ``fused``."""
+    instances, kernels = inputs.instances, inputs.kernels
+    scores = texts.vectors.new_zeros((instances.pool.high_water, texts.prompts))
+    fused_pool = None if fused is None else fused.refreshed(inputs)
+    for rows in torch.split(instances.live()[1], max(1, _BLOCK_COSINES // len(texts.vectors))):
+        if fused is None or fused_pool is None:
+            cosines = kernels.cosines(instances.pool, rows, texts.vectors)
         else:
-            cosines = fused.cosines(inputs, instance_rows, texts)
-        self._cosines = cosines
-        self._place = torch.full((inputs.instances.pool.high_water,), -1, dtype=torch.int64, device=texts.device)
-        self._place[instance_rows] = torch.arange(len(instance_rows), device=texts.device)
-
-    def __call__(self, voxels: VoxelBlock) -> Tensor:
-        """As the protocol says."""
-        return self._cosines.index_select(0, self._place.index_select(0, voxels.top_rows))
+            cosines = kernels.cosines(fused_pool, rows, texts.vectors)
+            raw = ~fused.are_fused(rows)
+            if bool(raw.any()):
+                cosines[raw] = kernels.cosines(instances.pool, rows[raw], texts.vectors)
+        scores.index_copy_(0, rows, scores_of(cosines, texts))
+    return scores

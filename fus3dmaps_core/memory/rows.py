@@ -22,7 +22,7 @@ class RowPool:
     Attributes:
         dimension: Values d of a row.
         dtype: Storage type.
-        block_rows: Rows of a block.
+        block_rows: Rows of a block, a power of two.
         blocks: The blocks, (block_rows, d) each; row r is row r % block_rows of block r // block_rows.
         addresses: Address of each block's first value, for compiled kernels.
         scales: Step of each row's values; written for int8 only.

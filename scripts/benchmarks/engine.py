@@ -19,8 +19,9 @@ from benchmarks.measurements import Measurement, timed
 from benchmarks.timing import Times, collected_garbage, time_call, time_calls
 from benchmarks.workload import World, fill
 from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.layers.similarity import LAYERS
 from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.semantic_map import SemanticMap
 
 ELEMENT_BYTES = {"float32": 4, "float16": 2, "int8": 1}
 _VOXELS_PER_INSTANCE = 400

@@ -13,7 +13,8 @@ from reference.steps import FuseStep, RemoveStep, Setting, WindowStep, random_st
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.layers.similarity import LAYERS
+from fus3dmaps_core.semantic_map import SemanticMap
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)
@@ -26,7 +27,7 @@ in_every_dtype = pytest.mark.parametrize("dtype", DTYPES)
 def ask(engine: SemanticMap) -> None:
     """A query of every layer: it may compute what the next fusion would, but must not show in what is stored."""
     for layer in LAYERS:
-        engine.visit_similarity(layer, np.eye(1, engine.dimension, dtype=np.float32), lambda block: None)
+        engine.search(layer, np.eye(1, engine.dimension, dtype=np.float32))
 
 
 @on_every_backend

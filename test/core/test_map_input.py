@@ -135,26 +135,24 @@ def test_removal_at_bad_points_is_refused_and_leaves_no_trace(setting: Setting, 
 
 
 @pytest.mark.parametrize("texts", [pytest.param(value, id=name) for name, value in BAD_EMBEDDINGS.items()])
-def test_bad_texts_are_refused_and_leave_no_trace(setting: Setting, texts: np.ndarray):
+@pytest.mark.parametrize("which", ["prompts", "negatives"])
+def test_bad_texts_are_refused_and_leave_no_trace(setting: Setting, which: str, texts: np.ndarray):
     engine = used_map(setting)
-    with refused(engine, setting):
-        engine.visit_similarity("fused_instances", texts, lambda block: pytest.fail("nothing was to be visited"))
+    given = {"prompts": np.ones((1, setting.dimension)), which: texts}
+    with refused(engine, setting, match=which):
+        engine.search("fused_instances", **given)
+
+
+def test_no_prompt_is_refused_and_leaves_no_trace(setting: Setting):
+    engine = used_map(setting)
+    with refused(engine, setting, QueryError, "prompts"):
+        engine.search("dense", np.ones((0, setting.dimension)))
 
 
 def test_an_unknown_layer_is_refused_and_leaves_no_trace(setting: Setting):
     engine = used_map(setting)
     with refused(engine, setting, QueryError, "panoptic"):
-        engine.visit_similarity("panoptic", np.ones((1, 5)), lambda block: pytest.fail("nothing was to be visited"))
-
-
-def test_a_visitor_that_fails_leaves_no_trace(setting: Setting):
-    engine = used_map(setting)
-
-    def fail(block) -> None:
-        raise RuntimeError("no more room")
-
-    with refused(engine, setting, RuntimeError, "no more room"):
-        engine.visit_similarity("fused_dense", np.ones((1, 5)), fail)
+        engine.search("panoptic", np.ones((1, setting.dimension)))
 
 
 @pytest.mark.parametrize("what", ["voxels", "embeddings"])

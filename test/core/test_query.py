@@ -14,8 +14,9 @@ from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.errors import QueryError
+from fus3dmaps_core.layers.similarity import LAYERS
 from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.semantic_map import SemanticMap
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)

@@ -32,8 +32,9 @@ from reference.steps import (
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.layers.similarity import LAYERS
 from fus3dmaps_core.query import TextQuery
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.semantic_map import SemanticMap
 
 on_every_backend = pytest.mark.parametrize(("backend", "device"), BACKENDS, ids=BACKEND_IDS)
 in_every_dtype = pytest.mark.parametrize("dtype", DTYPES)

@@ -11,7 +11,8 @@ from reference.variants import DTYPES
 
 from fus3dmaps_core.config import Config, MapConfig
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_core.semantic_map import LAYERS, SemanticMap
+from fus3dmaps_core.layers.similarity import LAYERS
+from fus3dmaps_core.semantic_map import SemanticMap
 from fus3dmaps_core.storage import MapInfo, load_map, save_map
 
 
@@ -32,9 +33,7 @@ def filled_map(rng: np.random.Generator, dtype: str = "float32", frames: int = 4
 
 
 def cosines(semantic_map: SemanticMap, layer: str) -> np.ndarray:
-    blocks: list[np.ndarray] = []
-    semantic_map.visit_similarity(layer, np.eye(2, 6), lambda block: blocks.append(block.cosines))
-    return np.concatenate(blocks)
+    return np.stack([semantic_map.search(layer, prompt[None]).similarity for prompt in np.eye(2, 6)])
 
 
 INFO = MapInfo("lite", 12.5, "map", 77, Config(), np.tile(np.eye(4), (3, 1, 1)))

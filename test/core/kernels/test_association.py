@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.columns import columns
 from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
 
-from fus3dmaps_core.kernels.keys import MAX_COORDINATE, pack
-from fus3dmaps_core.kernels.protocols import EMPTY, Extents, Hypotheses, Pairs, SlotBlock
+from fus3dmaps_core.kernels.protocols import Pairs
 
 _seeds = st.integers(0, 2**32 - 1)
 MAX_COUNT = 2**31 - 1
@@ -22,26 +20,6 @@ MAX_COUNT = 2**31 - 1
 def backend(request):
     """Kernels and their device."""
     return kernels_of(*request.param), torch.device(request.param[1])
-
-
-def columns(held: list[dict[int, int]], places: int, id_of_row: list[int], device: torch.device, rng) -> Hypotheses:
-    """Columns of voxels that hold rows with counts, each voxel's in any order."""
-    rows, counts = np.full((len(held), places), -1, np.int32), np.zeros((len(held), places), np.int32)
-    for slot, of_voxel in enumerate(held):
-        order = rng.permutation(places)[: len(of_voxel)]
-        rows[slot, order], counts[slot, order] = list(of_voxel), list(of_voxel.values())
-    flat = [(row, count) for of_voxel in held for row, count in of_voxel.items()]
-    voxels = Counter(row for row, _ in flat)
-    observations = [sum(count for row, count in flat if row == each) for each in range(len(id_of_row))]
-    arrays = (
-        rows,
-        counts,
-        np.array(id_of_row, np.int64),
-        np.array([voxels[each] for each in range(len(id_of_row))], np.int32),
-        np.array(observations, np.int64),
-        np.zeros(len(id_of_row), bool),
-    )
-    return Hypotheses(*(torch.tensor(each, device=device) for each in arrays))
 
 
 class PlainAssociation:
@@ -176,59 +154,3 @@ def test_without_any_instance_no_voxel_has_a_top_hypothesis(backend):
     held = columns([{}, {}, {}], 3, [], device, np.random.default_rng(0))
     rows, counts = kernels.top_hypotheses(held, torch.tensor([2, 0], device=device))
     assert (rows.tolist(), counts.tolist()) == ([-1, -1], [0, 0])
-
-
-def test_a_survey_adds_up_what_instances_occupy_and_picks_voxels_by_layer(backend):
-    kernels, device = backend
-
-    @settings(max_examples=60)
-    @given(_seeds, st.integers(0, 40), st.integers(1, 3), st.booleans(), st.booleans())
-    def check(seed, count, parts, with_dense, with_instance):
-        rng = np.random.default_rng(seed)
-        spans = rng.choice([2, 1000, MAX_COORDINATE], (count, 1))
-        coordinates = rng.integers(-spans, spans + 1, (count, 3))
-        alive = rng.random(count) < 0.9
-        dense_rows = np.where(alive & (rng.random(count) < 0.6), rng.permutation(count), -1)
-        id_of_row = [4, -1, 9, 2, 7]
-        voxels = [
-            {int(row): int(rng.integers(1, 1000)) for row in rng.permutation([0, 2, 3, 4])[: rng.integers(0, 4)]}
-            if each
-            else {}
-            for each in alive
-        ]
-        held = columns(voxels, 3, id_of_row, device, rng)
-        keys = torch.where(torch.tensor(alive), pack(torch.tensor(coordinates)), EMPTY).to(device)
-        none, nowhere = (
-            torch.zeros(5, dtype=torch.int64, device=device),
-            torch.zeros((5, 3), dtype=torch.int64, device=device),
-        )
-        far = torch.full_like(nowhere, 2**62)
-        extents = Extents(voxels=none, counts=none.clone(), sums=nowhere, low=far, high=-far)
-        picked = []
-        for part in np.array_split(np.arange(count), parts):
-            first, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
-            rows = torch.tensor(dense_rows[first:end].astype(np.int32), device=device)
-            block = SlotBlock(first=first, keys=keys[first:end], dense_rows=rows, voxel_size_m=0.25)
-            found = kernels.survey(block, held, extents, with_dense, with_instance)
-            picked += zip(
-                *(each.tolist() for each in (found.centers_m, found.dense_rows, found.top_rows, found.top_counts)),
-                strict=True,
-            )
-
-        tops = [min(each.items(), key=lambda pair: (-pair[1], id_of_row[pair[0]]), default=(-1, 0)) for each in voxels]
-        expected = [
-            ([float(np.float32((value + 0.5) * 0.25)) for value in coordinates[slot]], dense_rows[slot], *tops[slot])
-            for slot in range(count)
-            if (with_dense and dense_rows[slot] >= 0) or (with_instance and tops[slot][0] >= 0)
-        ]
-        assert picked == expected
-        owners, counts = (np.array([top[axis] for top in tops], np.int64) for axis in (0, 1))
-        for row in range(5):
-            mine = owners == row
-            assert extents.voxels[row] == mine.sum()
-            assert extents.counts[row] == counts[mine].sum()
-            assert extents.sums[row].tolist() == (counts[mine, None] * coordinates[mine]).sum(axis=0).tolist()
-            assert extents.low[row].tolist() == (coordinates[mine].min(axis=0).tolist() if mine.any() else [2**62] * 3)
-            assert extents.high[row].tolist() == (coordinates[mine].max(axis=0).tolist() if mine.any() else [-(2**62)] * 3)
-
-    check()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from reference.agreement import ROUNDING
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES, kernels_of
 
-from fus3dmaps_core.kernels.protocols import Pairs
+from fus3dmaps_core.kernels.protocols import Fusable, Pairs
 from fus3dmaps_core.memory.rows import RowPool
 
 _seeds = st.integers(0, 2**32 - 1)
@@ -249,46 +250,7 @@ def test_the_cosine_of_nothing_is_nothing(backend, dtype: str):
     assert kernels.cosines(pool, rows, texts).tolist() == [[0.0, 0.0]] * 3
 
 
-@in_every_dtype
-def test_cosines_of_fused_rows(backend, dtype: str):
-    kernels, device = backend
-
-    @settings(max_examples=25)
-    @given(_seeds, st.integers(0, 3000), st.integers(1, 20), st.integers(1, 3))
-    def check(seed, count, width, prompts):
-        rng = np.random.default_rng(seed)
-        pool, own_pool = filled_pool(rng, 2000, width, dtype, device), filled_pool(rng, 50, width, "float32", device)
-        rows, own_rows = rng.integers(0, 2000, count), rng.integers(0, 50, count)
-        kind = rng.integers(0, 3, count)
-        rows[kind == 1], own_rows[kind == 2] = -1, -1
-        weights = np.where(rows < 0, 0.0, rng.uniform(0.01, 1e4, count)).astype(np.float32)
-        own_weights = np.where(own_rows < 0, 0.0, rng.choice([0.0, 0.5, 3e5], count)).astype(np.float32)
-        texts = unit(rng.normal(size=(prompts, width))).astype(np.float32)
-        tensors = {
-            name: torch.tensor(each, device=device) for name, each in locals().items() if isinstance(each, np.ndarray)
-        }
-        got = kernels.fused_cosines(
-            pool,
-            tensors["rows"],
-            tensors["weights"],
-            own_pool,
-            tensors["own_rows"],
-            tensors["own_weights"],
-            tensors["texts"],
-        )
-        dense = pool.read(tensors["rows"].clamp(min=0)).cpu().numpy().astype(np.float64)
-        own = own_pool.read(tensors["own_rows"].clamp(min=0)).cpu().numpy().astype(np.float64)
-        fused = weights[:, None].astype(np.float64) * dense + own_weights[:, None].astype(np.float64) * own
-        fused = np.where((rows < 0)[:, None], own, np.where((own_rows < 0)[:, None], dense, fused))
-        # What nearly cancels out keeps few digits.
-        lost = np.linalg.norm(fused, axis=1) < 1e-3 * np.maximum(weights, own_weights)
-        exact = exact_cosines(fused, texts)
-        np.testing.assert_allclose(got.cpu().numpy()[~lost], exact[~lost], atol=5e-4 if width < 3 else 5e-5)
-
-    check()
-
-
-# ---- weighted_sums
+# ---- fuse
 
 
 def random_layer(rng: np.random.Generator, rows: int, instances: int, width: int, dtype: str, device: torch.device):
@@ -304,49 +266,87 @@ def random_layer(rng: np.random.Generator, rows: int, instances: int, width: int
     return pool, slots.astype(np.int32), weights, held.astype(np.int32)
 
 
-def sums_of(kernels, device, layer, place, places: int):
-    pool, slots, weights, held = layer
-    arrays = (torch.tensor(each, device=device) for each in (slots, weights, held, np.asarray(place, np.int32)))
-    sums, totals = kernels.weighted_sums(pool, *arrays, places)
-    assert sums.dtype == totals.dtype == torch.float64
-    return sums.cpu().numpy(), totals.cpu().numpy()
+@dataclass
+class Fusion:
+    """A layer, the instances' own embeddings and weights, and where fused embeddings go."""
+
+    pool: RowPool
+    slots: np.ndarray
+    weights: np.ndarray
+    held: np.ndarray
+    own: RowPool
+    amounts: np.ndarray
+
+    def fuse(self, kernels, device, rows, bars=None) -> tuple[np.ndarray, np.ndarray]:
+        """What is written for the instances of the rows (NaN where nothing is), and their evidence."""
+        tensors = (torch.tensor(each, device=device) for each in (self.slots, self.weights, self.held))
+        target = RowPool(self.own.dimension, torch.float32, device)
+        target.allocate(self.own.high_water)
+        spoil(target)
+        where = torch.tensor(np.asarray(rows, np.int64), device=device)
+        bars = np.full(len(rows), -np.inf) if bars is None else bars
+        given = (torch.tensor(each, device=device) for each in (self.amounts[rows], bars))
+        evidence = kernels.fuse(Fusable(self.pool, *tensors), where, self.own, *given, target)
+        assert evidence.dtype == torch.float64
+        return target.read(where).cpu().numpy(), evidence.cpu().numpy()
+
+    def expected(self, device) -> tuple[np.ndarray, np.ndarray]:
+        """The same for every instance, by plain loops."""
+        means = self.pool.read(torch.arange(len(self.slots), device=device)).cpu().numpy().astype(np.float64)
+        own = self.own.read(torch.arange(self.own.high_water, device=device)).cpu().numpy().astype(np.float64)
+        sums, totals = self.amounts[:, None] * own, self.amounts.copy()
+        for row, slot in enumerate(self.slots):
+            for instance in self.held[slot] if slot >= 0 else ():
+                if instance >= 0:
+                    sums[instance] += float(self.weights[row]) * means[row]
+                    totals[instance] += float(self.weights[row])
+        fused = np.where(totals[:, None] > 0, sums / np.where(totals > 0, totals, 1.0)[:, None], own)
+        return fused, totals
+
+
+def random_fusion(rng: np.random.Generator, rows: int, instances: int, width: int, dtype: str, device) -> Fusion:
+    own = filled_pool(rng, instances, width, "float32", device)
+    amounts = rng.choice([0.0, 0.5, 300.0], instances)
+    return Fusion(*random_layer(rng, rows, instances, width, dtype, device), own, amounts)
 
 
 @in_every_dtype
 @pytest.mark.parametrize(("rows", "instances"), [(0, 4), (40, 5), (5000, 12)])
-def test_sums_over_the_voxels_of_instances(backend, dtype: str, rows: int, instances: int):
+def test_instances_are_fused_with_their_voxels(backend, dtype: str, rows: int, instances: int):
     kernels, device = backend
     rng = np.random.default_rng(rows)
-    layer = random_layer(rng, rows, instances, 17, dtype, device)
-    place = np.full(instances, -1)
+    fusion = random_fusion(rng, rows, instances, 17, dtype, device)
     asked = rng.permutation(instances)[: instances - 1]
-    place[asked] = np.arange(len(asked))
-    sums, totals = sums_of(kernels, device, layer, place, len(asked))
-    pool, slots, weights, held = layer
-    means = pool.read(torch.arange(rows, device=device)).cpu().numpy().astype(np.float64)
-    expected, expected_totals = np.zeros((len(asked), 17)), np.zeros(len(asked))
-    for row, slot in enumerate(slots):
-        for instance in held[slot] if slot >= 0 else ():
-            if instance >= 0 and place[instance] >= 0:
-                expected[place[instance]] += float(weights[row]) * means[row]
-                expected_totals[place[instance]] += float(weights[row])
-    assert totals.tolist() == expected_totals.tolist()
-    np.testing.assert_allclose(sums, expected, atol=3e-6 * max(1.0, expected_totals.max()))
+    fused, evidence = fusion.fuse(kernels, device, asked)
+    expected, totals = fusion.expected(device)
+    np.testing.assert_allclose(evidence, totals[asked], rtol=1e-12)
+    np.testing.assert_allclose(fused, expected[asked], atol=3e-6)
 
 
 @in_every_dtype
-def test_an_instances_sums_do_not_depend_on_which_others_are_asked_for(backend, dtype: str):
+def test_only_instances_above_their_bar_are_written(backend, dtype: str):
+    kernels, device = backend
+    fusion = random_fusion(np.random.default_rng(8), 3000, 9, 17, dtype, device)
+    expected, totals = fusion.expected(device)
+    bars = totals + np.array([-1.0, 0.0, 1.0] * 3)
+    fused, evidence = fusion.fuse(kernels, device, np.arange(9), bars)
+    np.testing.assert_allclose(evidence, totals, rtol=1e-12)
+    written = np.arange(9) % 3 == 0
+    np.testing.assert_allclose(fused[written], expected[written], atol=3e-6)
+    assert np.isnan(fused[~written]).all()
+
+
+@in_every_dtype
+def test_an_instances_fusion_does_not_depend_on_which_others_are_asked_for(backend, dtype: str):
     kernels, device = backend
     instances = 9
-    layer = random_layer(np.random.default_rng(3), 6000, instances, 40, dtype, device)
-    everything, totals = sums_of(kernels, device, layer, np.arange(instances), instances)
+    fusion = random_fusion(np.random.default_rng(3), 6000, instances, 40, dtype, device)
+    everything, totals = fusion.fuse(kernels, device, np.arange(instances))
 
     @settings(max_examples=15)
     @given(st.permutations(range(instances)), st.integers(1, instances))
     def check(order, count):
-        place = np.full(instances, -1)
-        place[order[:count]] = np.arange(count)
-        some, some_totals = sums_of(kernels, device, layer, place, count)
+        some, some_totals = fusion.fuse(kernels, device, np.array(order[:count]))
         assert some.tobytes() == everything[order[:count]].tobytes()
         assert some_totals.tobytes() == totals[order[:count]].tobytes()
 
@@ -365,7 +365,7 @@ def set_threads():
 def test_results_do_not_depend_on_the_number_of_threads(backend, set_threads, dtype: str):
     kernels, device = backend
     rng = np.random.default_rng(11)
-    layer = random_layer(rng, 9000, 9, 40, dtype, device)
+    fusion = random_fusion(rng, 9000, 9, 40, dtype, device)
     texts = torch.tensor(unit(rng.normal(size=(3, 40))), dtype=torch.float32, device=device)
     embeddings = torch.tensor(rng.normal(size=(9000, 40)), device=device)
     each = torch.arange(9000, device=device)
@@ -376,11 +376,9 @@ def test_results_do_not_depend_on_the_number_of_threads(backend, set_threads, dt
         units = kernels.unit_rows(embeddings)[0]
         pool = filled_pool(np.random.default_rng(2), 9000, 40, dtype, device)
         kernels.merge_means(pool, each, weights, 4 * weights, each, groups, 3 * weights, units)
-        sums, totals = sums_of(kernels, device, layer, np.arange(9), 9)
-        cosines = kernels.cosines(layer[0], each, texts)
-        fused = kernels.fused_cosines(layer[0], each, weights, pool, each, weights, texts) if dtype == "float32" else cosines
-        arrays = [array.cpu().numpy() for array in (units, pool.read(each), cosines, fused)]
-        return [array.tobytes() for array in (*arrays, sums, totals)]
+        cosines = kernels.cosines(fusion.pool, each, texts)
+        arrays = [array.cpu().numpy() for array in (units, pool.read(each), cosines)]
+        return [array.tobytes() for array in (*arrays, *fusion.fuse(kernels, device, np.arange(9)))]
 
     results = []
     for threads in (1, 2, 1):

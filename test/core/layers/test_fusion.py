@@ -10,7 +10,6 @@ from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.semantic_map import SemanticMap
-from fus3dmaps_core.snapshots import SimilarityBlock
 
 SIZE_M = 0.5
 X, Y, Z = np.eye(3)
@@ -53,14 +52,9 @@ def fused(semantic_map: SemanticMap, instance_id: int = 0) -> tuple[np.ndarray, 
 
 def cosines(semantic_map: SemanticMap, layer: str) -> dict[int, np.ndarray]:
     """Per voxel the cosines with x, y and z: the direction of its embedding."""
-    found: dict[int, np.ndarray] = {}
-
-    def collect(block: SimilarityBlock) -> None:
-        numbers = np.floor(block.centers_m[:, 0] / SIZE_M).astype(int)
-        found.update(zip(numbers.tolist(), block.cosines, strict=True))
-
-    semantic_map.visit_similarity(layer, np.eye(3, dtype=np.float32), collect)
-    return found
+    findings = [semantic_map.search(layer, axis[None]) for axis in np.eye(3, dtype=np.float32)]
+    numbers = np.floor(findings[0].points_m[:, 0] / SIZE_M).astype(int)
+    return dict(zip(numbers.tolist(), np.stack([finding.similarity for finding in findings], axis=1), strict=True))
 
 
 def direction(vector) -> np.ndarray:
