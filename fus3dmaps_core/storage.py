@@ -1,30 +1,38 @@
-"""A saved map: a directory with a manifest and one .npy file per array.
+"""Saved maps: a directory with a manifest and one .npy file per array, replaced at one point or not at all.
 
-It is written under a temporary name beside its place, flushed to disk and renamed, so that a directory under its final name
-is always complete. The manifest holds the SHA-256 of every array; nothing in it is ever unpickled.
+Whenever a save ends, by success, refusal or a killed process, the directory holds the last map whose save was committed. The
+manifest holds the SHA-256 of every array; nothing in it is ever unpickled. ``docs/map_files.md`` has the format.
 """
 
 from __future__ import annotations
 
-import hashlib
-import json
-import os
-import shutil
-from collections.abc import Callable
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from fus3dmaps_core.config import Config, MapConfig
 from fus3dmaps_core.errors import ConfigError, MapError, StorageError
 from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.storage_files import commit, is_own_name, opened, read_array, write_array, writing_to
+from fus3dmaps_core.storage_manifest import FORMAT_VERSION, MANIFEST, Manifest, read_manifest
 
-FORMAT_VERSION = 1
-_MANIFEST = "manifest.json"
-_FORMAT = "fus3dmaps-map"
+__all__ = [
+    "FORMAT_VERSION",
+    "MapInfo",
+    "check_fits",
+    "check_map_target",
+    "load_map",
+    "read_manifest",
+    "restore_map",
+    "save_map",
+]
+
+_POSES = "camera_poses"
 
 
 @dataclass(frozen=True)
@@ -49,46 +57,75 @@ class MapInfo:
 
 
 def check_map_target(directory: Path) -> None:
-    """Raise StorageError if the place holds something that is not a map, which saving would have to destroy."""
-    if directory.exists() and not (directory / _MANIFEST).is_file():
+    """Refuse a place where saving would have to destroy something else than a map that this program reads.
+
+    Raises:
+        StorageError: The place holds something that is not a map, a map of another version or one whose manifest is
+            damaged, or cannot be looked at; the message names it.
+    """
+    try:
+        # Listed once: looked up one by one, a manifest that another save commits meanwhile would be taken for a stranger.
+        names = {path.name for path in directory.iterdir()}
+    except FileNotFoundError:
+        return
+    except NotADirectoryError:
+        raise StorageError(f"'{directory}' exists and is not a saved map; it is left as it is") from None
+    except OSError as error:
+        raise StorageError(f"cannot read '{directory}': {error}") from None
+    if MANIFEST in names:
+        try:
+            read_manifest(directory)
+        except StorageError as error:
+            raise StorageError(f"{error}; '{directory}' is left as it is") from None
+    # A save that was killed before its first commit leaves nothing but files of its own.
+    elif not all(is_own_name(name) for name in names):
         raise StorageError(f"'{directory}' exists and is not a saved map; it is left as it is")
 
 
-def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo) -> None:
+def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo, saved_ns: int | None = None) -> int:
     """Write a map, replacing a map that is there.
 
+    The map is copied at one moment, under its lock, and goes on changing while the copy is written. Beside that copy a save
+    needs some megabytes of memory. Arrays that are on disk already are not written again.
+
+    Args:
+        directory: Where; it and its parents are made. Until the save is complete it holds what it held.
+        semantic_map: The map.
+        info: What else is to be known of it.
+        saved_ns: Time of the save, nanoseconds since 1970, by which maps are ordered; None takes the system's clock.
+
+    Returns:
+        Bytes of the map on disk.
+
     Raises:
-        StorageError: The place holds something that is not a map, or cannot be written; what was there is still there.
+        StorageError: The place holds something that is not a map, cannot be written, or is being saved to by another
+            process or thread; what was there is still there, and nothing else.
     """
     check_map_target(directory)
-    arrays = {**semantic_map.export_state(), "camera_poses": info.camera_poses}
-    temporary = directory.with_name(f".{directory.name}.{os.getpid()}.writing")
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir(parents=True)
-        files = {name: _write_array(temporary / f"{name}.npy", array) for name, array in arrays.items()}
-        manifest = {
-            "format": _FORMAT,
-            "version": FORMAT_VERSION,
-            "encoder": info.encoder,
-            "logit_scale": info.logit_scale,
-            "map_frame": info.map_frame,
-            "stamp_ns": info.stamp_ns,
-            "dimension": semantic_map.dimension,
-            "variance_ratio": semantic_map.variance_ratio,
-            "config": info.config.flat(),
-            "arrays": files,
-        }
-        text = json.dumps(manifest, indent=1).encode()
-        _write(temporary / _MANIFEST, lambda path: path.write_bytes(text))
-        _swap(temporary, directory)
-    except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
+        with writing_to(directory):
+            arrays = {**semantic_map.export_state(), _POSES: info.camera_poses}
+            # Arrays are let go one by one, so that the copy shrinks while it is written.
+            entries = {name: write_array(directory, name, arrays.pop(name)) for name in tuple(arrays)}
+            manifest = Manifest(
+                saved_ns=time.time_ns() if saved_ns is None else saved_ns,
+                encoder=info.encoder,
+                logit_scale=info.logit_scale,
+                map_frame=info.map_frame,
+                stamp_ns=info.stamp_ns,
+                dimension=semantic_map.dimension,
+                variance_ratio=semantic_map.variance_ratio,
+                config=info.config,
+                arrays=entries,
+            )
+            commit(directory, manifest)
+    except (OSError, ValidationError) as error:
         raise StorageError(f"cannot write map '{directory}': {error}") from None
+    return manifest.size_bytes()
 
 
 def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo]:
-    """Read a map.
+    """Read a map into a new one of its own configuration.
 
     Args:
         directory: What :func:`save_map` wrote.
@@ -97,91 +134,87 @@ def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo
     Raises:
         StorageError: It is no map, of another version, incomplete or altered; the message names the file.
     """
-    manifest = _read_manifest(directory)
+    manifest, arrays = _read(directory)
+    info = _info(directory, manifest, arrays)
     try:
-        config = Config.from_flat(manifest["config"])
-        map_config = MapConfig.model_validate({**config.map.model_dump(), "device": device})
-        arrays = {name: _read_array(directory, name, entry) for name, entry in manifest["arrays"].items()}
-        poses = arrays.pop("camera_poses")
+        map_config = MapConfig.model_validate({**info.config.map.model_dump(), "device": device})
         semantic_map = SemanticMap(
-            int(manifest["dimension"]), map_config, float(manifest["variance_ratio"]), config.fusion.window_radius_m
+            manifest.dimension, map_config, manifest.variance_ratio, info.config.fusion.window_radius_m
         )
         semantic_map.import_state(arrays)
-        info = MapInfo(
-            str(manifest["encoder"]),
-            float(manifest["logit_scale"]),
-            str(manifest["map_frame"]),
-            int(manifest["stamp_ns"]),
-            config,
-            poses,
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, ConfigError, MapError) as error:
-        raise StorageError(f"'{directory / _MANIFEST}' does not describe a map: {error}") from None
+    except (ValueError, ConfigError, MapError) as error:
+        raise _no_map(directory, error) from None
     return semantic_map, info
 
 
-def _read_manifest(directory: Path) -> dict[str, Any]:
-    path = directory / _MANIFEST
-    if not path.is_file():
-        raise StorageError(f"'{directory}' is not a saved map: it has no {_MANIFEST}")
+def restore_map(directory: Path, semantic_map: SemanticMap, config: Config, encoder: str) -> MapInfo:
+    """Replace the content of a running map by a saved one; a refusal leaves the running map as it was.
+
+    Args:
+        directory: What :func:`save_map` wrote.
+        semantic_map: The running map.
+        config: The running configuration.
+        encoder: Name of the encoder trio that runs.
+
+    Returns:
+        What else the saved map tells.
+
+    Raises:
+        StorageError: It is no map, of another version, incomplete or altered, or does not fit; see :func:`check_fits`.
+    """
+    check_fits(directory, read_manifest(directory), config, encoder, semantic_map.dimension)
+    manifest, arrays = _read(directory)
+    check_fits(directory, manifest, config, encoder, semantic_map.dimension)  # It may have been replaced meanwhile.
+    info = _info(directory, manifest, arrays)
     try:
-        manifest = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise StorageError(f"cannot read '{path}': {error}") from None
-    if not isinstance(manifest, dict) or manifest.get("format") != _FORMAT:
-        raise StorageError(f"'{path}' is not the manifest of a saved map")
-    if manifest.get("version") != FORMAT_VERSION:
-        raise StorageError(f"'{path}' has format version {manifest.get('version')}; this program reads {FORMAT_VERSION}")
-    return manifest
+        semantic_map.import_state(arrays)
+    except MapError as error:
+        raise _no_map(directory, error) from None
+    return info
 
 
-def _write_array(path: Path, array: NDArray[Any]) -> dict[str, Any]:
-    _write(path, lambda where: np.save(where, array, allow_pickle=False))
-    return {"dtype": str(array.dtype), "shape": list(array.shape), "sha256": _digest(path)}
+def check_fits(directory: Path, manifest: Manifest, config: Config, encoder: str, dimension: int) -> None:
+    """Refuse a saved map that a running configuration cannot go on with.
+
+    Args:
+        directory: Where the map is, for the message.
+        manifest: What the map says of itself.
+        config: The running configuration.
+        encoder: Name of the encoder trio that runs.
+        dimension: Its embedding width d.
+
+    Raises:
+        StorageError: Encoder, embedding dimension, voxel size, number of hypotheses or map frame differ; the message gives
+            both values of each.
+    """
+    saved, running = manifest.config, config
+    pairs = {
+        "encoder": (manifest.encoder, encoder),
+        "embedding dimension": (manifest.dimension, dimension),
+        "map.voxel_size_m": (saved.map.voxel_size_m, running.map.voxel_size_m),
+        "map.max_hypotheses": (saved.map.max_hypotheses, running.map.max_hypotheses),
+        "input.map_frame": (manifest.map_frame, running.input.map_frame),
+    }
+    differences = [f"{name} is {was!r}, here {now!r}" for name, (was, now) in pairs.items() if was != now]
+    if differences:
+        raise StorageError(f"map '{directory}' does not fit this configuration: its {'; its '.join(differences)}")
 
 
-def _read_array(directory: Path, name: str, entry: dict[str, Any]) -> NDArray[Any]:
-    if not name.isidentifier():
-        raise StorageError(f"'{directory / _MANIFEST}' names an array '{name}', which cannot be one")
-    path = directory / f"{name}.npy"
-    try:
-        if _digest(path) != entry["sha256"]:
-            raise StorageError(f"'{path}' is damaged: its checksum is not the manifest's")
-        array: NDArray[Any] = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise StorageError(f"cannot read '{path}': {error}") from None
-    if str(array.dtype) != entry["dtype"] or list(array.shape) != entry["shape"]:
-        raise StorageError(
-            f"'{path}' holds {array.dtype} {array.shape}, the manifest says {entry['dtype']} {entry['shape']}"
-        )
-    return array
+def _read(directory: Path) -> tuple[Manifest, dict[str, NDArray[Any]]]:
+    with opened(directory) as (manifest, files):
+        entries = manifest.arrays
+        return manifest, {
+            name: read_array(directory / entries[name].file_name(name), file, entries[name]) for name, file in files.items()
+        }
 
 
-def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _info(directory: Path, manifest: Manifest, arrays: dict[str, NDArray[Any]]) -> MapInfo:
+    """Take the camera poses out of the arrays and put together what the map tells besides."""
+    poses = arrays.pop(_POSES, None)
+    if poses is None or poses.shape[1:] != (4, 4) or poses.dtype != np.float64:
+        raise _no_map(directory, f"array '{_POSES}' must be there and be (n, 4, 4) float64")
+    return MapInfo(manifest.encoder, manifest.logit_scale, manifest.map_frame, manifest.stamp_ns, manifest.config, poses)
 
 
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    write(path)
-    _sync(path)
-
-
-def _sync(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _swap(temporary: Path, directory: Path) -> None:
-    """Put the complete new directory in the place of the old one."""
-    _sync(temporary)
-    old = directory.with_name(f".{directory.name}.{os.getpid()}.replaced")
-    if directory.exists():
-        shutil.rmtree(old, ignore_errors=True)
-        directory.rename(old)
-    temporary.rename(directory)
-    _sync(directory.parent)
-    shutil.rmtree(old, ignore_errors=True)
+def _no_map(directory: Path, cause: object) -> StorageError:
+    return StorageError(f"'{directory / MANIFEST}' does not describe a map: {cause}")

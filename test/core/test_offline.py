@@ -57,7 +57,7 @@ def test_two_runs_and_their_files_are_equal_bit_for_bit(recording: Path, tmp_pat
     for name in ("a", "b"):
         pipeline = make_pipeline()
         map_recording(recording, pipeline)
-        save_map(tmp_path / name, pipeline.semantic_map, map_info(pipeline))
+        save_map(tmp_path / name, pipeline.semantic_map, map_info(pipeline), saved_ns=1)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert files == sorted(path.name for path in (tmp_path / "b").iterdir())
     assert [name for name in files if (tmp_path / "a" / name).read_bytes() != (tmp_path / "b" / name).read_bytes()] == []
