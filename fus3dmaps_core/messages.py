@@ -1,12 +1,12 @@
 """From ROS messages to arrays, without ROS: anything that has a message's fields will do.
 
-The functions take ``sensor_msgs/Image``, ``sensor_msgs/CameraInfo``, ``geometry_msgs/PoseStamped`` and ``nav_msgs/Odometry``
-as rclpy delivers them or as rosbags deserialises them. Every refusal is a FrameError whose message names the topic.
+The functions take images, ``sensor_msgs/CameraInfo`` and poses as rclpy delivers them or as rosbags deserialises them. Every
+refusal is a FrameError whose message names the topic. Images are decoded in :mod:`fus3dmaps_core.images`.
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,33 +14,24 @@ from scipy.spatial.transform import Rotation
 
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics
+from fus3dmaps_core.geometry.distortion import Distortion
+from fus3dmaps_core.images import about, check_color, check_depth, decode_color, decode_depth, image_size
+
+__all__ = [
+    "check_color",
+    "check_depth",
+    "decode_color",
+    "decode_depth",
+    "image_size",
+    "stamp_ns",
+    "to_distortion",
+    "to_intrinsics",
+    "to_pose",
+    "transform_from",
+    "transform_of",
+]
 
 _QUATERNION_TOLERANCE = 1e-2  # Publishers round; farther from unit length is not a rotation but a bug or an unset field.
-
-
-class _Encoding(NamedTuple):
-    """How a pixel is stored: scalar type, number of channels, and which of them are red, green and blue (or all three)."""
-
-    dtype: np.dtype[Any]
-    channels: int = 1
-    rgb: slice = slice(0, 1)
-
-
-_FORWARD, _BACKWARD = slice(0, 3), slice(2, None, -1)
-
-
-_COLOR_ENCODINGS = {
-    "rgb8": _Encoding(np.dtype(np.uint8), 3, _FORWARD),
-    "bgr8": _Encoding(np.dtype(np.uint8), 3, _BACKWARD),
-    "rgba8": _Encoding(np.dtype(np.uint8), 4, _FORWARD),
-    "bgra8": _Encoding(np.dtype(np.uint8), 4, _BACKWARD),
-    "mono8": _Encoding(np.dtype(np.uint8)),
-}
-_DEPTH_ENCODINGS = {
-    "16UC1": _Encoding(np.dtype(np.uint16)),
-    "mono16": _Encoding(np.dtype(np.uint16)),
-    "32FC1": _Encoding(np.dtype(np.float32)),
-}
 
 
 def stamp_ns(message: Any) -> int:
@@ -49,55 +40,10 @@ def stamp_ns(message: Any) -> int:
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
-def check_color(message: Any, topic: str) -> None:
-    """Check a colour image's encoding, sizes and data length without touching its pixels.
-
-    Raises:
-        FrameError: Reasons ``unknown_encoding``, ``bad_image`` (no pixels, rows too short) or ``size_mismatch`` (the data
-            is not height x step bytes).
-    """
-    _checked_encoding(message, topic, _COLOR_ENCODINGS)
-
-
-def check_depth(message: Any, topic: str) -> None:
-    """As :func:`check_color`, for a depth image."""
-    _checked_encoding(message, topic, _DEPTH_ENCODINGS)
-
-
-def decode_color(message: Any, topic: str) -> NDArray[np.uint8]:
-    """The pixels of a colour or grey image as (H, W, 3) uint8, red first; a fresh array.
-
-    Raises:
-        FrameError: As :func:`check_color`.
-    """
-    encoding = _checked_encoding(message, topic, _COLOR_ENCODINGS)
-    colors = _pixels(message, encoding)[:, :, encoding.rgb]
-    return np.array(np.broadcast_to(colors, (*colors.shape[:2], 3)), order="C")
-
-
-def decode_depth(message: Any, topic: str, unit_m: float) -> NDArray[np.float32]:
-    """The readings of a depth image as (h, w) float32 metres; no reading stays 0 (16 bit) or 0, NaN or inf (float).
-
-    Args:
-        message: Image of encoding 16UC1, mono16 or 32FC1.
-        topic: Where it came from, for error messages.
-        unit_m: Metres per unit of a 16-bit image; float images are metres [REP-118].
-
-    Raises:
-        FrameError: As :func:`check_depth`.
-    """
-    encoding = _checked_encoding(message, topic, _DEPTH_ENCODINGS)
-    readings = _pixels(message, encoding)[:, :, 0].astype(np.float32)
-    if encoding.dtype == np.uint16:
-        readings *= np.float32(unit_m)
-    return readings
-
-
 def to_intrinsics(message: Any, topic: str) -> Intrinsics:
     """The pinhole model of a ``CameraInfo``, for the image as published: region of interest and binning are applied.
 
-    The raw camera matrix K is used; distortion coefficients are not: colour images are expected rectified, or of a lens
-    whose distortion is negligible.
+    The raw camera matrix K is used; :func:`to_distortion` gives what the lens adds to it.
 
     Raises:
         FrameError: Reason ``bad_intrinsics``: a focal length or size is not positive, or a value not finite.
@@ -107,28 +53,50 @@ def to_intrinsics(message: Any, topic: str) -> Intrinsics:
     roi = message.roi
     if roi.width and roi.height:
         cx, cy, width, height = cx - roi.x_offset, cy - roi.y_offset, int(roi.width), int(roi.height)
-    try:
+    with about(topic):
         full = Intrinsics(fx, fy, cx, cy, width, height)
         return full.resized(width // max(int(message.binning_x), 1), height // max(int(message.binning_y), 1))
-    except FrameError as error:
-        raise FrameError(f"{topic}: {error}", reason=error.reason) from None
+
+
+def to_distortion(message: Any, topic: str) -> Distortion | None:
+    """The lens distortion of a ``CameraInfo``, None where the image needs no rectification.
+
+    It goes with :func:`to_intrinsics`: coefficients are of rays, not of pixels, so neither region of interest nor binning
+    changes them. None means an unset model or coefficients that are all 0, as ROS reads it: also of ``equidistant``.
+
+    Raises:
+        FrameError: Reason ``bad_intrinsics``: an unknown model, a wrong number of coefficients or a value not finite.
+    """
+    model = str(message.distortion_model)
+    coefficients = tuple(float(value) for value in message.d)
+    with about(topic):
+        if not np.all(np.isfinite(coefficients)):
+            raise FrameError(f"distortion coefficients {coefficients} are not finite", reason="bad_intrinsics")
+        if not model or not any(coefficients):
+            return None
+        return Distortion(model, coefficients)
 
 
 def to_pose(message: Any, topic: str) -> NDArray[np.float64]:
-    """The pose of a ``PoseStamped`` or an ``Odometry`` as a (4, 4) float64 transform into its header's frame.
+    """The pose of a ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry`` in its header's frame, (4, 4) float64.
 
     Raises:
         FrameError: Reason ``bad_pose``: a value is not finite, or the quaternion's length is off 1 by more than 0.01.
     """
     pose = message.pose
-    pose = getattr(pose, "pose", pose)  # Odometry wraps it with a covariance.
-    position, orientation = pose.position, pose.orientation
-    try:
-        return transform_from(
-            (position.x, position.y, position.z, orientation.x, orientation.y, orientation.z, orientation.w)
-        )
-    except FrameError as error:
-        raise FrameError(f"{topic}: {error}", reason=error.reason) from None
+    pose = getattr(pose, "pose", pose)  # The latter two wrap it with a covariance.
+    with about(topic):
+        return _transform(pose.position, pose.orientation)
+
+
+def transform_of(message: Any, topic: str) -> NDArray[np.float64]:
+    """The transform of a ``TransformStamped``, (4, 4) float64: the pose of its child frame in its header's frame.
+
+    Raises:
+        FrameError: As :func:`to_pose`.
+    """
+    with about(topic):
+        return _transform(message.transform.translation, message.transform.rotation)
 
 
 def transform_from(values: tuple[float, ...] | list[float]) -> NDArray[np.float64]:
@@ -151,33 +119,5 @@ def transform_from(values: tuple[float, ...] | list[float]) -> NDArray[np.float6
     return T
 
 
-def _checked_encoding(message: Any, topic: str, encodings: dict[str, _Encoding]) -> _Encoding:
-    encoding = encodings.get(message.encoding)
-    if encoding is None:
-        raise FrameError(
-            f"{topic}: unknown encoding '{message.encoding}', known are {', '.join(encodings)}", reason="unknown_encoding"
-        )
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if height <= 0 or width <= 0:
-        raise FrameError(f"{topic}: image of {width}x{height} pixels", reason="bad_image")
-    row_bytes = width * encoding.channels * encoding.dtype.itemsize
-    if step < row_bytes:
-        raise FrameError(
-            f"{topic}: step of {step} bytes is too short for {width} pixels of {message.encoding} ({row_bytes} bytes)",
-            reason="bad_image",
-        )
-    if len(message.data) != height * step:
-        raise FrameError(
-            f"{topic}: image of {height} rows of {step} bytes holds {len(message.data)} bytes, not {height * step}",
-            reason="size_mismatch",
-        )
-    return encoding
-
-
-def _pixels(message: Any, encoding: _Encoding) -> NDArray[Any]:
-    """View of the pixels, (H, W, channels), in the byte order of the message."""
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    row_bytes = width * encoding.channels * encoding.dtype.itemsize
-    rows = np.frombuffer(message.data, dtype=np.uint8).reshape(height, step)[:, :row_bytes]
-    dtype = encoding.dtype.newbyteorder(">" if message.is_bigendian else "<")
-    return np.ascontiguousarray(rows).view(dtype).reshape(height, width, encoding.channels)
+def _transform(position: Any, orientation: Any) -> NDArray[np.float64]:
+    return transform_from((position.x, position.y, position.z, orientation.x, orientation.y, orientation.z, orientation.w))

@@ -14,6 +14,30 @@ from scipy.spatial.transform import Rotation
 
 from fus3dmaps_core import messages
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
+
+NO_BEND = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def pose_with_covariance(stamp_ns, position, quaternion):
+    covered = ros.odometry(stamp_ns, position, quaternion)
+    return ros.make("geometry_msgs/msg/PoseWithCovarianceStamped", covered.header, covered.pose)
+
+
+def transform_stamped(stamp_ns, position, quaternion):
+    moved = ros.make(
+        "geometry_msgs/msg/Transform",
+        ros.make("geometry_msgs/msg/Vector3", *position),
+        ros.make("geometry_msgs/msg/Quaternion", *quaternion),
+    )
+    return ros.make("geometry_msgs/msg/TransformStamped", ros.header(stamp_ns, "map"), "camera", moved)
+
+
+def camera_info(model: str, coefficients, **changes):
+    message = ros.camera_info(0, 640, 480, 500.0, **changes)
+    message.distortion_model, message.d = model, np.array(coefficients, float)
+    return message
+
 
 COLOR_LAYOUTS = {"rgb8": (0, 1, 2), "bgr8": (2, 1, 0), "rgba8": (0, 1, 2, None), "bgra8": (2, 1, 0, None)}
 
@@ -129,7 +153,58 @@ def test_uncalibrated_camera_is_refused(focal):
     assert caught.value.reason == "bad_intrinsics"
 
 
-@pytest.mark.parametrize("build", [ros.pose, ros.odometry])
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        ("plumb_bob", (-0.3, 0.1, 0.001, -0.002, 0.0)),
+        ("plumb_bob", (-0.3, 0.1, 0.001, -0.002)),
+        ("rational_polynomial", (0.5, -2.6, 0.0, 0.0, 1.5, 0.4, -2.4, 1.45)),
+        ("equidistant", (0.0, 0.01, 0.0, 0.0)),
+    ],
+)
+def test_distortion(model, coefficients):
+    assert messages.to_distortion(camera_info(model, coefficients), "/info") == Distortion(model, coefficients)
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("plumb_bob", NO_BEND), ("rational_polynomial", [0] * 8), ("equidistant", [0] * 4), ("plumb_bob", ()), ("", ()),
+     ("", (0.1, 0, 0, 0, 0)), ("none", NO_BEND)],
+)  # fmt: skip
+def test_no_distortion(model, coefficients):
+    assert messages.to_distortion(camera_info(model, coefficients), "/info") is None
+
+
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [("fov", (0.9,)), ("plumb_bob", (0.1,) * 6), ("equidistant", (0.1,) * 5), ("plumb_bob", (0.1, np.nan, 0, 0, 0)),
+     ("", (np.inf,)), ("rational_polynomial", (0.1,) * 5)],
+)  # fmt: skip
+def test_unusable_distortion_is_refused(model, coefficients):
+    with pytest.raises(FrameError, match=r"^/info: ") as caught:
+        messages.to_distortion(camera_info(model, coefficients), "/info")
+    assert caught.value.reason == "bad_intrinsics"
+
+
+def test_distortion_of_a_binned_region_is_that_of_the_whole_image():
+    """Rectifying the part is taking the part of the rectified: coordinates tell the pixels of the whole image apart."""
+    lens = ("plumb_bob", (-0.2, 0.05, 0.001, 0.002, 0.0))
+    whole, part = camera_info(*lens), camera_info(*lens, binning=(2, 2), roi=(100, 40, 400, 320))
+    column, row = np.meshgrid(np.arange(640, dtype=np.float32), np.arange(480, dtype=np.float32))
+
+    def rectify(info, image):
+        return Rectifier(messages.to_intrinsics(info, "/info"), messages.to_distortion(info, "/info")).depth(image)
+
+    for coordinate in (column, row):
+        binned = coordinate[40:440, 100:420].reshape(200, 2, 160, 2).mean(axis=(1, 3))
+        found, expected = rectify(part, binned), rectify(whole, coordinate)[40:440, 100:420].reshape(200, 2, 160, 2)
+        inside = found > 0
+        assert inside.mean() > 0.9
+        # A nearest pixel of the part is half of its 2 x 2 off, one of the whole half of 1.
+        assert np.abs(found - expected.mean(axis=(1, 3)))[inside].max() < 2
+
+
+@pytest.mark.parametrize("build", [ros.pose, ros.odometry, pose_with_covariance, transform_stamped])
 @given(
     position=st.tuples(*[st.floats(-1e4, 1e4)] * 3),
     quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: np.linalg.norm(q) > 1e-3),
@@ -137,7 +212,8 @@ def test_uncalibrated_camera_is_refused(focal):
 )
 def test_poses_agree_with_scipy(build, position, quaternion, scale):
     unit = np.array(quaternion) / np.linalg.norm(quaternion)
-    T = messages.to_pose(build(0, position, (unit * scale).tolist()), "/pose")
+    convert = messages.transform_of if build is transform_stamped else messages.to_pose
+    T = convert(build(0, position, (unit * scale).tolist()), "/pose")
     np.testing.assert_array_equal(T[:3, 3], position)
     np.testing.assert_allclose(T[:3, :3], Rotation.from_quat(unit).as_matrix(), atol=1e-12)
     np.testing.assert_array_equal(T[3], [0, 0, 0, 1])
@@ -155,9 +231,10 @@ def test_poses_agree_with_scipy(build, position, quaternion, scale):
     ],
 )
 def test_poses_that_are_no_poses_are_refused(position, quaternion):
-    for build in (ros.pose, ros.odometry):
+    for build in (ros.pose, ros.odometry, pose_with_covariance, transform_stamped):
+        convert = messages.transform_of if build is transform_stamped else messages.to_pose
         with pytest.raises(FrameError, match=r"^/tracker: ") as caught:
-            messages.to_pose(build(0, position, quaternion), "/tracker")
+            convert(build(0, position, quaternion), "/tracker")
         assert caught.value.reason == "bad_pose"
 
 
