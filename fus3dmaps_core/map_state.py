@@ -17,9 +17,13 @@ from fus3dmaps_core.layers.fused_instances import FusedInstances
 from fus3dmaps_core.layers.instances import InstanceLayer
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rounding import seeds_of
+from fus3dmaps_core.memory_budget import KeyframeBound, MemoryUse
 from fus3dmaps_core.voxels.hash import VoxelHash
 
 _UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
+_CELL_BYTES, _KEY_BYTES, _LEAST_ROWS = 12, 8, 1024  # Of the hash, and what a column has at least.
+_INSTANCE_BYTES = 50  # Of an instance beside its embeddings.
+_ADDRESS_BYTES, _LEAST_ADDRESSES = 8, 16  # Of the blocks of a pool.
 
 
 class MapState:
@@ -37,6 +41,7 @@ class MapState:
         """Start empty."""
         device = torch.device(config.device)
         self._device = device
+        self._windowed = windowed
         self.hash = VoxelHash(kernels, device)
         self.colors = Column(torch.uint8, _UNSEEN_COLOR, device, width=3)
         self.dense = DenseLayer(dimension, getattr(torch, config.dtype), kernels, device)
@@ -68,6 +73,48 @@ class MapState:
             "dense": self.dense.nbytes - self.dense.link_nbytes,
             "instances": self.instances.nbytes + self.fused.nbytes,
         }
+
+    def memory_use(self, bound: KeyframeBound) -> MemoryUse:
+        """Allocated bytes, and what a keyframe of at most this size can make of them."""
+        allocated, pool = sum(self.nbytes().values()), self.dense.pool
+        lasting = allocated - (self.dense.nbytes - self.dense.link_nbytes)
+        return MemoryUse(
+            allocated,
+            lasting,
+            lasting + self._voxel_growth(bound.voxels) + self._instance_growth(bound.instances),
+            len(self.dense),
+            bound.dense_voxels,
+            len(pool.blocks) * pool.block_rows,
+            pool.block_rows,
+            self.dense.block_nbytes,
+        )
+
+    def _voxel_growth(self, count: int) -> int:
+        """Bytes by which the hash and the columns of slots grow for so many new voxels, at most."""
+        held = self.instances.held()
+        capacity, needed = len(held), self.hash.high_water + count
+        wider = 0
+        if needed > capacity:
+            doubled = max(2 * capacity, _LEAST_ROWS)
+            # The layers grow one after the other: what just sufficed for the first is doubled for the second.
+            wider = (doubled if needed <= doubled else 2 * needed) - capacity
+        colors, link, hypotheses = 3, 4, 8 * held.shape[1]
+        # A table has a power of two cells; the list of free slots that is counted with it is shorter.
+        cells = before = 1 << (((self.hash.nbytes - _KEY_BYTES * capacity) // _CELL_BYTES).bit_length() - 1)
+        if 2 * (len(self.hash) + count) > cells:
+            while 4 * (len(self.hash) + count) > cells:
+                cells *= 2
+        return wider * (_KEY_BYTES + colors + link + hypotheses) + (cells - before) * _CELL_BYTES
+
+    def _instance_growth(self, count: int) -> int:
+        """Bytes by which what is known of instances grows for so many new ones, at most."""
+        pool = self.instances.pool
+        rows = max(pool.high_water, len(pool) + count)
+        blocks = -(-rows // pool.block_rows) - len(pool.blocks)
+        pools = 2 if self._windowed else 3  # Their own embeddings and the stored fused ones; without a window the current.
+        row_bytes = pools * pool.dimension * pool.dtype.itemsize
+        addresses = pools * _ADDRESS_BYTES * (blocks + max(len(pool.blocks), _LEAST_ADDRESSES))
+        return blocks * pool.block_rows * row_bytes + max(rows, _LEAST_ROWS) * _INSTANCE_BYTES + addresses
 
     def export(self) -> dict[str, NDArray[Any]]:
         """Everything as arrays by name, voxels in the order of their slots.

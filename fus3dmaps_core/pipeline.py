@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.config import Config
+from fus3dmaps_core.encoders.batching import Batches, naming_out_of_memory
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.motion import KeyframeGate
 from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sample_pixels, unproject
 from fus3dmaps_core.masks import Masks
+from fus3dmaps_core.memory_budget import KeyframeBound, MemoryBudget
 from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
@@ -33,6 +35,9 @@ class FrameReport:
         dense: Whether it was a dense keyframe.
         instances: Whether it was an instance keyframe.
         proposals: Proposals integrated.
+        dropped_dense_voxels: Voxels that lost their dense embedding so that the map keeps within its memory budget.
+        window_radius_m: Effective radius of the sliding window, metres, which the budget may have made smaller; 0 for a map
+            without a window.
         durations_s: Wall time by stage, seconds.
     """
 
@@ -40,6 +45,8 @@ class FrameReport:
     dense: bool = False
     instances: bool = False
     proposals: int = 0
+    dropped_dense_voxels: int = 0
+    window_radius_m: float = 0.0
     durations_s: dict[str, float] = field(default_factory=dict)
 
     @contextmanager
@@ -76,6 +83,13 @@ class Pipeline:
         gates = config.keyframes
         self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
         self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
+        self._crop_batches = Batches(f"crop encoder of '{trio.name}'")
+        self._budget = MemoryBudget(
+            config.map.memory_budget_mib,
+            config.fusion.window_radius_m,
+            config.map.voxel_size_m,
+            _keyframe_bound(config, trio),
+        )
         self._processed = 0
         self.stamp_ns = 0
         self._camera_poses: list[NDArray[np.float64]] = []
@@ -99,14 +113,23 @@ class Pipeline:
     def process(self, frame: PosedFrame) -> FrameReport:
         """Integrate a frame, if it is a keyframe of one of the layers [sec: Implementation Details].
 
-        A layer's inference runs before that layer is touched: what fails leaves the layer as it was.
+        A layer's inference runs before that layer is touched: what fails leaves the layer as it was. Room within the memory
+        budget is made before the map grows, so that a frame that fails half-way cannot take more than was planned.
+
+        Raises:
+            EncoderError: An encoder or the segmenter has not enough memory for a single image.
         """
         T = frame.T_world_camera
         report = FrameReport(frame.stamp_ns, self._dense_gate.wants(T), self._instance_gate.wants(T))
+        report.window_radius_m = self.semantic_map.window_radius_m
         if not (report.dense or report.instances):
             return report
         with report.timed("resize"):
             working = resize_frame(frame, self.config.image)
+        if self.config.map.memory_budget_mib > 0:
+            with report.timed("memory"):
+                report.dropped_dense_voxels = self._budget.make_room(self.semantic_map, T[:3, 3])
+                report.window_radius_m = self.semantic_map.window_radius_m
         if report.dense:
             self._integrate_dense(working, T, report)
             self._dense_gate.accept(T)
@@ -137,7 +160,7 @@ class Pipeline:
         return np.array(list(self._camera_poses), dtype=np.float64).reshape(-1, 4, 4)
 
     def _integrate_dense(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
-        with report.timed("patch_encoder"):
+        with report.timed("patch_encoder"), naming_out_of_memory(f"patch encoder of '{self.trio.name}'"):
             patches = self.trio.patch.encode_patches(working.rgb)
         with report.timed("dense_update"):
             rows, columns, dimension = patches.embeddings.shape
@@ -154,13 +177,16 @@ class Pipeline:
             )
 
     def _integrate_instances(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
-        with report.timed("segmentation"):
+        with report.timed("segmentation"), naming_out_of_memory(f"segmenter '{self.config.segmenter.name}'"):
             masks = filter_masks(self._segmenter.segment(working.rgb, working.depth_m), self.config.segmenter)
             proposals, ys, xs, masks = self._proposal_pixels(working, masks)
         if not len(masks):
             return
         with report.timed("crop_encoder"):
-            embeddings = self.trio.crop.encode_crops(working.rgb, masks)
+            embeddings = self._crop_batches.run(
+                lambda rows: self.trio.crop.encode_crops(working.rgb, Masks(masks.masks[rows], masks.boxes[rows])),
+                len(masks),
+            )
         with report.timed("instance_update"):
             points = unproject(working.depth_m, ys, xs, working.intrinsics, T)
             self.semantic_map.integrate_proposals(points, proposals, embeddings)
@@ -179,3 +205,60 @@ class Pipeline:
         seen = np.flatnonzero(inside.any(axis=1))
         proposals, samples = np.nonzero(inside[seen])
         return proposals, ys[samples], xs[samples], masks.take(seen)
+
+    def empty_map(self) -> SemanticMap:
+        """Another map like this pipeline's, with nothing in it."""
+        return SemanticMap(
+            self.trio.dimension,
+            self.config.map,
+            self.config.fusion.variance_ratio or self.trio.variance_ratio,
+            self.config.fusion.window_radius_m,
+        )
+
+    def restore(self, semantic_map: SemanticMap, stamp_ns: int, camera_poses: NDArray[np.float64]) -> None:
+        """Go on from another map; the next frame is a keyframe of both layers.
+
+        Args:
+            semantic_map: Takes the place of the pipeline's; made by :meth:`empty_map`, whatever was put into it since.
+            stamp_ns: Time of its newest keyframe, nanoseconds.
+            camera_poses: (n, 4, 4) T_world_camera of its keyframes.
+        """
+        self._dense_gate.reset()
+        self._instance_gate.reset()
+        self._processed = 0
+        self.stamp_ns = stamp_ns
+        self._camera_poses = [pose.copy() for pose in camera_poses]
+        self.semantic_map = semantic_map
+
+    def reconfigure(self, config: Config) -> None:
+        """Take over what of a configuration a running pipeline can change; the map and the models stay.
+
+        That is how keyframes are chosen, masks filtered and windows fused, and the memory budget. With other thresholds of
+        motion the next frame is a keyframe.
+
+        Args:
+            config: Sections ``encoder`` and ``sampling``, and the map's own properties, must be those of the present one.
+        """
+        gates_changed = config.keyframes != self.config.keyframes
+        self.config = config
+        if gates_changed:
+            gates = config.keyframes
+            self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
+            self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
+        self._budget = MemoryBudget(
+            config.map.memory_budget_mib,
+            config.fusion.window_radius_m,
+            config.map.voxel_size_m,
+            _keyframe_bound(config, self.trio),
+        )
+        if not config.map.memory_budget_mib and config.fusion.window_radius_m > 0:
+            self.semantic_map.set_window_radius(config.fusion.window_radius_m)  # Nothing else would widen it again.
+
+
+def _keyframe_bound(config: Config, trio: EncoderTrio) -> KeyframeBound:
+    """The most that a keyframe can add: each of its samples in a voxel of its own, each mask a new instance."""
+    rows, columns = trio.patch.grid(config.image.height, config.image.width)
+    dense, instances = (
+        rows * columns * samples for samples in (config.sampling.dense_per_patch, config.sampling.instance_per_patch)
+    )
+    return KeyframeBound(dense + instances, dense, config.segmenter.max_masks)

@@ -1,4 +1,4 @@
-"""Text queries: prompts to similarities of every voxel of a layer, and to ranked instances."""
+"""Queries by text or by image: similarities of every voxel of a layer, and ranked instances."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.protocols import TextEncoder
+from fus3dmaps_core.encoders.protocols import CropEncoder, TextEncoder
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.layers.similarity import LAYERS
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.search import Finding
 from fus3dmaps_core.semantic_map import SemanticMap
 from fus3dmaps_core.snapshots import InstanceSnapshot
 
 DEFAULT_LAYER = "fused_instances"
+IMAGE_PROMPT = "image"
+"""What answers to an image have in the place of a prompt."""
+
+_MIN_IMAGE_PX = 8
 _MAX_PROMPT_LENGTH = 4096
 _MAX_PROMPTS = 256
 
@@ -45,20 +50,30 @@ class TextQuery:
         """Raise QueryError, naming the field, unless the query can be asked of a map."""
         if not self.prompts:
             raise QueryError("prompts: at least one prompt is needed")
-        for name, texts in (("prompts", self.prompts), ("negative_prompts", self.negative_prompts)):
-            if len(texts) > _MAX_PROMPTS:
-                raise QueryError(f"{name}: {len(texts)} are more than the {_MAX_PROMPTS} that are allowed")
-            for index, text in enumerate(texts):
-                if not text.strip():
-                    raise QueryError(f"{name}[{index}]: is empty")
-                if len(text) > _MAX_PROMPT_LENGTH:
-                    raise QueryError(f"{name}[{index}]: {len(text)} characters are more than {_MAX_PROMPT_LENGTH}")
-        if self.layer not in LAYERS:
-            raise QueryError(f"layer: unknown layer '{self.layer}', known are {', '.join(LAYERS)}")
+        check_texts("prompts", self.prompts)
+        check_texts("negative_prompts", self.negative_prompts)
+        check_layer(self.layer)
         if self.threshold is not None and not math.isfinite(self.threshold):
             raise QueryError(f"threshold: must be a finite number, got {self.threshold}")
         if self.top_k < 1:
             raise QueryError(f"top_k: must be at least 1, got {self.top_k}")
+
+
+def check_texts(field: str, texts: Sequence[str]) -> None:
+    """Raise QueryError, naming the field, if there are too many texts or one of them is empty or too long."""
+    if len(texts) > _MAX_PROMPTS:
+        raise QueryError(f"{field}: {len(texts)} are more than the {_MAX_PROMPTS} that are allowed")
+    for index, text in enumerate(texts):
+        if not text.strip():
+            raise QueryError(f"{field}[{index}]: is empty")
+        if len(text) > _MAX_PROMPT_LENGTH:
+            raise QueryError(f"{field}[{index}]: {len(text)} characters are more than {_MAX_PROMPT_LENGTH}")
+
+
+def check_layer(layer: str) -> None:
+    """Raise QueryError unless this is one of LAYERS."""
+    if layer not in LAYERS:
+        raise QueryError(f"layer: unknown layer '{layer}', known are {', '.join(LAYERS)}")
 
 
 @dataclass(frozen=True)
@@ -113,10 +128,68 @@ def answer_query(semantic_map: SemanticMap, text_encoder: TextEncoder, query: Te
         QueryError: The query is malformed or the layer is empty; the message names the field.
     """
     query.check()
+    _check_not_empty(semantic_map)
+    texts = text_encoder.encode_text([*query.prompts, *query.negative_prompts])
+    count = len(query.prompts)
+    return _answer(semantic_map, query, texts[:count], texts[count:], logit_scale)
+
+
+def embed_image(crop_encoder: CropEncoder, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Embed a picture of one thing as the crops of objects are embedded: the whole image is its mask.
+
+    Args:
+        crop_encoder: Of the trio whose space the map lives in.
+        rgb: (H, W, 3) uint8.
+
+    Returns:
+        (1, d) float32, unit length.
+
+    Raises:
+        QueryError: The image is too small to show anything.
+    """
+    height, width = rgb.shape[:2]
+    if min(height, width) < _MIN_IMAGE_PX:
+        raise QueryError(f"image: {width}x{height} pixels are too few, at least {_MIN_IMAGE_PX}x{_MIN_IMAGE_PX} are needed")
+    return crop_encoder.encode_crops(rgb, Masks.from_masks(np.ones((1, height, width), bool)))
+
+
+def answer_image_query(
+    semantic_map: SemanticMap,
+    embedding: NDArray[np.float32],
+    text_encoder: TextEncoder,
+    query: TextQuery,
+    logit_scale: float,
+) -> QueryAnswer:
+    """Answer a query whose one prompt is an image; otherwise as :func:`answer_query`.
+
+    Args:
+        semantic_map: The map, which is not changed.
+        embedding: (1, d) of the image, see :func:`embed_image`.
+        text_encoder: Encodes the negative prompts.
+        query: Its only prompt is the name that the answers bear, IMAGE_PROMPT.
+        logit_scale: Factor of the cosines where there are negative prompts.
+
+    Raises:
+        QueryError: The query is malformed or the layer is empty; the message names the field.
+    """
+    query.check()
+    _check_not_empty(semantic_map)
+    negative = text_encoder.encode_text(query.negative_prompts) if query.negative_prompts else embedding[:0]
+    return _answer(semantic_map, query, embedding, negative, logit_scale)
+
+
+def _check_not_empty(semantic_map: SemanticMap) -> None:
     if semantic_map.voxel_count == 0:
         raise QueryError("the map is empty: nothing has been mapped yet")
-    texts = text_encoder.encode_text([*query.prompts, *query.negative_prompts])
-    positive, negative = texts[: len(query.prompts)], texts[len(query.prompts) :]
+
+
+def _answer(
+    semantic_map: SemanticMap,
+    query: TextQuery,
+    positive: NDArray[np.float32],
+    negative: NDArray[np.float32],
+    logit_scale: float,
+) -> QueryAnswer:
     found = semantic_map.search(
         query.layer,
         positive,

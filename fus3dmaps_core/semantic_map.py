@@ -6,6 +6,7 @@ refused has changed nothing.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from typing import Any
@@ -22,6 +23,7 @@ from fus3dmaps_core.layers.fusion import FusionInputs
 from fus3dmaps_core.layers.similarity import LAYERS, layer_named
 from fus3dmaps_core.map_input import check_state, float_tensor, index_tensor, unit_rows, voxel_keys, weight_tensor
 from fus3dmaps_core.map_state import MapState
+from fus3dmaps_core.memory_budget import KeyframeBound, MemoryUse
 from fus3dmaps_core.search import Finding, Question, Survey
 from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, VoxelSnapshot
 
@@ -45,11 +47,17 @@ class SemanticMap:
         self.dimension = dimension
         self.config = config
         self.variance_ratio = variance_ratio
-        self.window_radius_m = window_radius_m
+        self._given_radius_m = self._radius_m = window_radius_m
         self._device = torch.device(config.device)
         self._kernels = select_kernels(config.backend, self._device)
         self._lock = threading.RLock()
         self._state = self._empty_state()
+
+    @property
+    def window_radius_m(self) -> float:
+        """Effective radius of the sliding window, metres; 0 for a map without one."""
+        with self._lock:
+            return self._radius_m
 
     @property
     def voxel_count(self) -> int:
@@ -74,10 +82,16 @@ class SemanticMap:
         with self._lock:
             return self._state.nbytes()
 
+    def memory_use(self, bound: KeyframeBound) -> MemoryUse:
+        """Allocated bytes, and what a keyframe of at most this size can make of them."""
+        with self._lock:
+            return self._state.memory_use(bound)
+
     def reset(self) -> None:
-        """Empty the map; instance ids start at 0 again."""
+        """Empty the map; instance ids start at 0 again, and the window is as wide as the map was made with."""
         with self._lock:
             self._state = self._empty_state()
+            self._radius_m = self._given_radius_m
 
     def integrate_dense(
         self,
@@ -152,6 +166,22 @@ class SemanticMap:
             self._state.fused.admit(created)
         return ids.cpu().numpy()
 
+    def set_window_radius(self, radius_m: float) -> None:
+        """Change the effective radius of the sliding window; what is farther is dropped by the next pruning.
+
+        Args:
+            radius_m: Metres, greater than 0.
+
+        Raises:
+            MapError: The map was made without a window, or the radius is not a finite number greater than 0.
+        """
+        if self._given_radius_m <= 0:
+            raise MapError("radius_m: the map was made without a window")
+        if not 0.0 < radius_m < math.inf:
+            raise MapError(f"radius_m: must be a finite number greater than 0, got {radius_m}")
+        with self._lock:
+            self._radius_m = radius_m
+
     def prune_window(self, center_m: NDArray[np.floating]) -> int:
         """Drop the dense embeddings of voxels whose centre is farther than the window's radius [sec: Sliding Window].
 
@@ -165,16 +195,51 @@ class SemanticMap:
             MapError: The position is not three finite numbers.
         """
         center = float_tensor("center_m", center_m, (3,), self._device, torch.float64)
-        if self.window_radius_m <= 0:
+        if self._given_radius_m <= 0:
             return 0
         with self._lock:
             rows, slots = self._state.dense.live()
             keys = self._state.hash.keys(slots)
-            gone = self._kernels.farther(keys, self.config.voxel_size_m, center, self.window_radius_m)
+            gone = self._kernels.farther(keys, self.config.voxel_size_m, center, self._radius_m)
             if len(gone):
                 self._state.instances.touch(slots.index_select(0, gone))
                 self._state.dense.drop(rows.index_select(0, gone))
             return len(gone)
+
+    def drop_least_observed(self, count: int) -> int:
+        """Drop the dense embeddings of the voxels of least weight w^D; of equal ones those of the lowest slots.
+
+        Slots are given in the order in which voxels came, but those of removed voxels are given again. Voxels, hypotheses
+        and instances stay.
+
+        Args:
+            count: How many, if there are as many.
+
+        Returns:
+            Number of voxels that lost their dense embedding.
+
+        Raises:
+            MapError: The count is less than 0.
+        """
+        if count < 0:
+            raise MapError(f"count: must not be less than 0, got {count}")
+        with self._lock:
+            rows = self._state.dense.least_observed(count)
+            if len(rows):
+                self._state.instances.touch(self._state.dense.slots(rows))
+                self._state.dense.drop(rows)
+            return len(rows)
+
+    def release_unused(self) -> int:
+        """Give memory back that no dense embedding is in, in whole blocks; what the map holds and answers is the same.
+
+        Returns:
+            Bytes by which the allocated ones became fewer.
+        """
+        with self._lock:
+            before = self._state.dense.nbytes
+            self._state.dense.compact()
+            return before - self._state.dense.nbytes
 
     def remove_voxels(self, points_m: NDArray[np.floating]) -> int:
         """Remove the voxels that contain the points, with all that both layers know of them.
@@ -298,7 +363,7 @@ class SemanticMap:
             self._state = fresh
 
     def _empty_state(self) -> MapState:
-        return MapState(self.dimension, self.config, self.window_radius_m > 0, self._kernels)
+        return MapState(self.dimension, self.config, self._given_radius_m > 0, self._kernels)
 
     def _fusion_inputs(self) -> FusionInputs:
         return FusionInputs(self._kernels, self._state.dense, self._state.instances, self.variance_ratio)

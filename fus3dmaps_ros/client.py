@@ -15,12 +15,12 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.messages import stamp_ns, to_pose
 from fus3dmaps_core.query import RankedInstance
-from fus3dmaps_msgs.srv import QueryText
+from fus3dmaps_msgs.srv import LoadMap, QueryImage, QueryText, SaveMap
 from fus3dmaps_ros.conversions import from_cloud, unpack_rgb
 
 _LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -82,10 +82,64 @@ class MapperClient:
             top_k=top_k,
             publish=publish,
         )
-        future = self._query.call_async(request)
+        return self._call(self._query, request, timeout_s)
+
+    def ask_image(
+        self,
+        image: Image,
+        *,
+        negative_prompts: Sequence[str] = (),
+        layer: str = "",
+        threshold: float = 0.0,
+        top_k: int = 0,
+        publish: bool = False,
+        timeout_s: float = 60.0,
+    ) -> QueryImage.Response:
+        """Ask for the thing that fills an image.
+
+        Raises:
+            QueryError: The node refuses, with its own words, or does not answer in time.
+        """
+        request = QueryImage.Request(
+            image=image,
+            negative_prompts=list(negative_prompts),
+            layer=layer,
+            threshold=threshold,
+            top_k=top_k,
+            publish=publish,
+        )
+        return self._call_once(QueryImage, "query_image", request, timeout_s)
+
+    def save_map(self, name: str, timeout_s: float = 60.0) -> SaveMap.Response:
+        """Have the node save its map under a name.
+
+        Raises:
+            QueryError: The node refuses, with its own words, or does not answer in time.
+        """
+        return self._call_once(SaveMap, "save_map", SaveMap.Request(name=name), timeout_s)
+
+    def load_map(self, name: str = "", timeout_s: float = 60.0) -> LoadMap.Response:
+        """Have the node go on from a saved map; without a name from the newest.
+
+        Raises:
+            QueryError: The node refuses, with its own words, or does not answer in time.
+        """
+        return self._call_once(LoadMap, "load_map", LoadMap.Request(name=name), timeout_s)
+
+    def _call_once(self, service_type: Any, name: str, request: Any, timeout_s: float) -> Any:
+        client = self._node.create_client(service_type, f"{self._name}/{name}")
+        try:
+            if not client.wait_for_service(timeout_sec=timeout_s):
+                raise QueryError(f"no node '{self._name}' answers on {self._name}/{name} within {timeout_s:.0f} s")
+            return self._call(client, request, timeout_s)
+        finally:
+            self._node.destroy_client(client)
+
+    def _call(self, client: Any, request: Any, timeout_s: float) -> Any:
+        future = client.call_async(request)
         self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
         if not future.done():
-            self._query.remove_pending_request(future)
+            client.remove_pending_request(future)
             raise QueryError(f"node '{self._name}' did not answer within {timeout_s:.0f} s")
         response = future.result()
         if not response.success:
@@ -133,7 +187,7 @@ class MapperClient:
         raise QueryError(f"nothing new is published on {self._name}/{topic} within {timeout_s:.0f} s")
 
 
-def ranked_instances(response: QueryText.Response) -> list[RankedInstance]:
+def ranked_instances(response: QueryText.Response | QueryImage.Response) -> list[RankedInstance]:
     """The instances of a reply, best first."""
     return [
         RankedInstance(
@@ -154,7 +208,9 @@ def _position(point: Any) -> NDArray[np.float32]:
     return np.array([point.x, point.y, point.z], np.float32)
 
 
-def similarity_points(response: QueryText.Response) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def similarity_points(
+    response: QueryText.Response | QueryImage.Response,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
     table = from_cloud(response.similarity)
     return np.stack([table[axis] for axis in "xyz"], axis=1), np.array(table["similarity"])

@@ -19,6 +19,7 @@ from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker, MarkerArray
 
 from fus3dmaps_core.colors import similarity_colors
+from fus3dmaps_core.labels import LabelledVoxels
 from fus3dmaps_core.query import QueryAnswer, RankedInstance
 from fus3dmaps_core.snapshots import InstanceSnapshot, VoxelSnapshot
 from fus3dmaps_msgs.msg import SemanticInstance
@@ -117,6 +118,22 @@ def empty_similarity_cloud(header: Header) -> PointCloud2:
     return to_cloud(header, np.empty((0, 3), np.float32), {"similarity": nothing, "rgb": nothing})
 
 
+def to_label_cloud(header: Header, voxels: LabelledVoxels) -> PointCloud2:
+    """Labelled voxels: x, y, z, label (int32), score and rgb (one colour a label)."""
+    colors = np.zeros((int(voxels.labels.max(initial=0)) + 1, 3), np.uint8)
+    for label in np.unique(voxels.labels).tolist():
+        color = instance_color(label, alpha=1.0)
+        colors[label] = [round(255 * part) for part in (color.r, color.g, color.b)]
+    columns = {"label": voxels.labels, "score": voxels.scores, "rgb": pack_rgb(colors[voxels.labels])}
+    return to_cloud(header, voxels.points_m, columns)
+
+
+def empty_label_cloud(header: Header) -> PointCloud2:
+    """A label cloud without points."""
+    nothing = np.empty(0, np.float32)
+    return to_label_cloud(header, LabelledVoxels("", np.empty((0, 3), np.float32), np.empty(0, np.int32), nothing))
+
+
 def to_map_cloud(header: Header, voxels: VoxelSnapshot) -> PointCloud2:
     """The voxels of the map: x, y, z, rgb (mean colour) and instance (id of the top hypothesis, -1 without one)."""
     columns = {"rgb": pack_rgb(voxels.colors), "instance": voxels.top_instance.astype(np.int32)}
@@ -136,6 +153,22 @@ def to_instance(header: Header, found: RankedInstance) -> SemanticInstance:
         box_max=to_point(found.box_max_m),
         voxels=int(found.voxels),
     )
+
+
+def to_instances(header: Header, instances: InstanceSnapshot, min_voxels: int) -> list[SemanticInstance]:
+    """The instances that occupy at least ``min_voxels`` voxels, and at least one, by ascending id; without a prompt."""
+    return [
+        SemanticInstance(
+            header=header,
+            id=int(instances.ids[row]),
+            weight=float(instances.weights[row]),
+            centroid=to_point(instances.centroids_m[row]),
+            box_min=to_point(instances.boxes_min_m[row]),
+            box_max=to_point(instances.boxes_max_m[row]),
+            voxels=int(instances.voxel_counts[row]),
+        )
+        for row in np.flatnonzero(instances.voxel_counts >= max(min_voxels, 1))
+    ]
 
 
 def to_point(position_m: NDArray[np.floating] | Sequence[float]) -> Point:
@@ -163,20 +196,41 @@ def to_markers(header: Header, instances: InstanceSnapshot, min_voxels: int) -> 
     for row in np.flatnonzero(instances.voxel_counts >= max(min_voxels, 1)):
         instance_id = int(instances.ids[row])
         low, high = instances.boxes_min_m[row], instances.boxes_max_m[row]
-        center = 0.5 * (low + high)
-        box = Marker(header=header, ns="boxes", id=instance_id, type=Marker.CUBE, action=Marker.ADD)
-        box.pose.position = to_point(center)
-        box.pose.orientation.w = 1.0
-        box.scale = Vector3(**dict(zip("xyz", (high - low).astype(float).tolist(), strict=True)))
-        box.color = instance_color(instance_id, alpha=0.3)
-        label = Marker(header=header, ns="labels", id=instance_id, type=Marker.TEXT_VIEW_FACING, action=Marker.ADD)
-        label.pose.position = to_point((center[0], center[1], high[2] + 0.5 * _LABEL_HEIGHT_M))
-        label.pose.orientation.w = 1.0
-        label.scale.z = _LABEL_HEIGHT_M
-        label.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
-        label.text = str(instance_id)
-        markers += [box, label]
+        markers += _labelled_box(header, instance_id, low, high, str(instance_id), instance_color(instance_id, alpha=0.3))
     return MarkerArray(markers=markers)
+
+
+def to_answer_markers(header: Header, found: Sequence[SemanticInstance]) -> MarkerArray:
+    """A translucent box for every instance of an answer, and over it the prompt and the score; without any, a clearing."""
+    markers = [Marker(header=header, action=Marker.DELETEALL)]
+    for number, instance in enumerate(found):
+        low, high = (np.array([corner.x, corner.y, corner.z]) for corner in (instance.box_min, instance.box_max))
+        text = f"{instance.prompt} {instance.score:.2f}"
+        markers += _labelled_box(header, number, low, high, text, instance_color(instance.id, alpha=0.4))
+    return MarkerArray(markers=markers)
+
+
+def _labelled_box(
+    header: Header,
+    number: int,
+    low_m: NDArray[np.floating],
+    high_m: NDArray[np.floating],
+    text: str,
+    color: ColorRGBA,
+) -> list[Marker]:
+    center_m = 0.5 * (low_m + high_m)
+    box = Marker(header=header, ns="boxes", id=number, type=Marker.CUBE, action=Marker.ADD)
+    box.pose.position = to_point(center_m)
+    box.pose.orientation.w = 1.0
+    box.scale = Vector3(**dict(zip("xyz", (high_m - low_m).astype(float).tolist(), strict=True)))
+    box.color = color
+    label = Marker(header=header, ns="labels", id=number, type=Marker.TEXT_VIEW_FACING, action=Marker.ADD)
+    label.pose.position = to_point((center_m[0], center_m[1], high_m[2] + 0.5 * _LABEL_HEIGHT_M))
+    label.pose.orientation.w = 1.0
+    label.scale.z = _LABEL_HEIGHT_M
+    label.color = ColorRGBA(r=1.0, g=1.0, b=1.0, a=1.0)
+    label.text = text
+    return [box, label]
 
 
 def instance_color(instance_id: int, alpha: float) -> ColorRGBA:

@@ -26,6 +26,8 @@ class DropLog:
         self._counts: Counter[str] = Counter()
         self._unreported: Counter[str] = Counter()
         self._due_s: dict[str, float] = {}
+        self.observe: Callable[[str, str, int], None] | None = None
+        """Is told every reason, sentence and number at once."""
 
     def count(self, reason: str, sentence: str, number: int = 1) -> None:
         """Count drops.
@@ -35,6 +37,9 @@ class DropLog:
             sentence: What happened to the latest of them; names the topic.
             number: How many.
         """
+        observe = self.observe
+        if observe is not None:
+            observe(reason, sentence, number)
         with self._lock:
             self._counts[reason] += number
             self._unreported[reason] += number

@@ -1,7 +1,8 @@
-"""The mapper node ``fus3dmaps``: wires topics and services to the pipeline."""
+"""The mapper node ``fus3dmaps``: a managed node that wires topics and services to the pipeline."""
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -12,37 +13,50 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import rclpy
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
-from rclpy.clock import Clock, ClockType
-from rclpy.executors import MultiThreadedExecutor
-from rclpy.node import Node
+import torch
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
+from std_msgs.msg import Header
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_msgs.msg import MapperStatus
+from fus3dmaps_ros.autosave import Autosave
 from fus3dmaps_ros.drops import DropLog
+from fus3dmaps_ros.executor import CallbackExecutor
 from fus3dmaps_ros.inputs import Inputs
+from fus3dmaps_ros.lifecycle import UNCONFIGURED, ManagedNode
+from fus3dmaps_ros.map_services import MapServices
+from fus3dmaps_ros.map_store import read_newest
 from fus3dmaps_ros.outputs import Outputs
 from fus3dmaps_ros.parameters import declare_parameters, follow_changes, unknown_overrides
-from fus3dmaps_ros.refusals import REFUSALS
-from fus3dmaps_ros.services import Services
+from fus3dmaps_ros.query_services import QueryServices
+from fus3dmaps_ros.refusals import REFUSALS, one_line
+from fus3dmaps_ros.session import Session, SessionHolder
+from fus3dmaps_ros.status import StatusPublisher, status_line, status_message
+from fus3dmaps_ros.watch import Watch
 from fus3dmaps_ros.worker import FrameWorker
 
 NODE_NAME = "fus3dmaps"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_STATUS_PERIOD_S = 5.0
 _STOP_TIMEOUT_S = 1.0
-# Inputs, outputs, queries and commands each have a group that runs one callback at a time.
-_EXECUTOR_THREADS = 4
 
 
-class MapperNode(Node):
-    """Maps what the camera sees and answers questions about it."""
+class MapperNode(ManagedNode):
+    """Maps what the camera sees and answers questions about it.
+
+    Unconfigured it has neither models nor a map; inactive it has both and answers, but takes no images; active it maps. Its
+    topics and services appear when it is configured for the first time.
+
+    Attributes:
+        config: The configuration in force.
+        drops: Counts messages and frames that were dropped.
+        autosave: Saves the map by period; None while unconfigured.
+    """
 
     def __init__(self, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config, **options: Any) -> None:
-        """Read the parameters, load the models and start to map.
+        """Read the parameters; nothing is loaded yet.
 
         Args:
             make_pipeline: Builds the pipeline from the configuration; loads the models.
@@ -50,64 +64,191 @@ class MapperNode(Node):
 
         Raises:
             ConfigError: A parameter is wrong; the message names it.
-            EncoderError: A model cannot be loaded.
         """
         super().__init__(NODE_NAME, **options)
         logger = self.get_logger()
+        self._make_pipeline = make_pipeline
+        self._sessions = SessionHolder()
+        self._outputs: Outputs | None = None
+        self._offered: list[QueryServices | MapServices] = []
+        self._inputs: Inputs | None = None
+        self._watch: Watch | None = None
+        self.autosave: Autosave | None = None
+        self.drops = DropLog(logger.warning)
         self.config = declare_parameters(self)
         for sentence in unknown_overrides(self):
             logger.warning(sentence)
-        logger.info(f"loading encoder '{self.config.encoder.name}' and segmenter '{self.config.segmenter.name}'")
-        started = time.monotonic()
-        self.pipeline = make_pipeline(self.config)
-        logger.info(f"models loaded in {time.monotonic() - started:.1f} s")
+        follow_changes(self, self._read_config, self._apply_config, lambda: self.state != UNCONFIGURED)
+        self._status = StatusPublisher(self, self._read_config, self.status_message, self._log_line)
 
-        self.drops = DropLog(logger.warning)
-        self.worker = FrameWorker(self.pipeline, self.config.node.queue_size, self.drops)
-        self._outputs = Outputs(self, self.pipeline, self.worker, self._read_config)
-        self._inputs = Inputs(self, self.config, self.worker.offer, self.drops)
-        self._offered = Services(self, self.pipeline, self.worker, self._inputs, self._outputs, self._read_config)
-        follow_changes(self, self._read_config, self._apply_config)
-        self._last_status = ""
-        self._status_timer = self.create_timer(
-            _STATUS_PERIOD_S,
-            self._log_status,
-            callback_group=MutuallyExclusiveCallbackGroup(),
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
-        self.worker.start()
-        logger.info("ready")
+    @property
+    def session(self) -> Session | None:
+        """Models, map and mapping thread; None while unconfigured."""
+        return self._sessions.current
+
+    @property
+    def pipeline(self) -> Pipeline:
+        """The pipeline; raises MapError while unconfigured."""
+        return self._sessions.require().pipeline
+
+    @property
+    def worker(self) -> FrameWorker:
+        """The thread that feeds the pipeline; raises MapError while unconfigured."""
+        return self._sessions.require().worker
+
+    def configure(self) -> None:
+        """Load and warm up the models, resume a saved map where that is wanted, and offer topics and services.
+
+        Raises:
+            EncoderError: A model cannot be loaded.
+        """
+        logger, config = self.get_logger(), self.config
+        logger.info(f"loading encoder '{config.encoder.name}' and segmenter '{config.segmenter.name}'")
+        started = time.monotonic()
+        pipeline = self._make_pipeline(config)
+        logger.info(f"models loaded in {time.monotonic() - started:.1f} s")
+        session = Session(pipeline, FrameWorker(pipeline, config.node.queue_size, self.drops))
+        session.worker.start()
+        self._sessions.replace(session)
+        if self.config is not config:
+            self._apply_config(self.config)  # Set while the models were loaded.
+        if config.node.resume:
+            self._resume(session)
+        self.autosave = Autosave(session, self._read_config, logger)
+        self.autosave.start()
+        if self._outputs is None:
+            # Once: a service or publisher that is destroyed while a callback uses it would take the executor with it.
+            self._outputs = Outputs(self, self._sessions, self._read_config)
+            self._offered = [
+                QueryServices(self, self._sessions, self._outputs, self._read_config),
+                MapServices(self, self._sessions, self._outputs, self._read_config, self._forget_inputs),
+            ]
+
+    def activate(self) -> None:
+        """Subscribe to the inputs and map.
+
+        Raises:
+            ConfigError: The inputs' parameters cannot be used.
+        """
+        self._inputs = Inputs(self, self.config, self.worker.offer, self.drops, self._arrived)
+        self._watch = Watch(self, self.config, self._inputs.streams, self._sessions.require())
+        self.worker.observer, self.drops.observe = self._watch, self._watch.dropped
+        self.get_logger().info("ready")
+
+    def deactivate(self) -> None:
+        """Unsubscribe; what waits to be mapped is dropped, the map stays."""
+        inputs, self._inputs = self._inputs, None
+        if inputs is not None:
+            inputs.close()
+        session, watch = self.session, self._watch
+        if session is not None:
+            session.worker.drop_waiting()
+            session.worker.observer = None
+        self.drops.observe, self._watch = None, None
+        if watch is not None:
+            watch.close()
+
+    def cleanup(self) -> None:
+        """Free the map and the models; a map that is saved by period is saved a last time."""
+        self._end_session()
+        if self._outputs is not None:
+            self._outputs.clear_answers()
+        gc.collect()
+        if torch.cuda.is_initialized():
+            torch.cuda.empty_cache()
+
+    def _end_session(self) -> None:
+        autosave, self.autosave = self.autosave, None
+        session = self.session
+        if autosave is not None:
+            autosave.stop(self.config.node.service_timeout_s)
+            if self.config.node.autosave_period_s > 0:
+                autosave.save_if_changed()
+        self._sessions.replace(None)
+        if session is not None and not session.worker.stop(self.config.node.service_timeout_s):
+            self.get_logger().warning("the frame in work goes on; its models are freed when it is done")
 
     def stop(self, timeout_s: float) -> bool:
-        """End the mapping thread; whether it ended in time."""
-        return self.worker.stop(timeout_s)
+        """Unsubscribe and end the threads, whatever the state; whether mapping ended in time.
+
+        An automatic save in work is not waited for: cut off, it leaves the map that was saved before.
+        """
+        self.deactivate()
+        if self.autosave is not None:
+            self.autosave.stop(0.0)
+        session = self.session
+        return session is None or session.worker.stop(timeout_s)
 
     def status(self) -> str:
         """One line on what came in, what was mapped, what was dropped and how large the map is."""
-        counts, semantic_map = self.worker.counts(), self.pipeline.semantic_map
-        drops = ", ".join(f"{reason} {count}" for reason, count in sorted(self.drops.counts().items()))
-        return (
-            f"{counts.frames} frames, {counts.not_keyframes} not keyframes, {counts.dense_keyframes} dense and "
-            f"{counts.instance_keyframes} instance keyframes, {self.worker.waiting} waiting; dropped: {drops or 'none'}; "
-            f"{semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances"
+        return status_line(self.session, self.drops.counts())
+
+    def status_message(self) -> MapperStatus:
+        """The report of this moment, as on ``~/status``."""
+        header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.input.map_frame)
+        return status_message(
+            header,
+            self.state,
+            self.config,
+            self.session,
+            self.autosave,
+            self.drops.counts(),
+            {} if self._watch is None else self._watch.diagnosis.rates_hz(),
+            self.problems(),
         )
 
-    def _log_status(self) -> None:
-        silent = self._inputs.silent()
-        status = self.status() + (f"; nothing received yet on {', '.join(silent)}" if silent else "")
-        if status != self._last_status:
-            self.get_logger().info(status)
-        self._last_status = status
+    def _resume(self, session: Session) -> None:
+        logger, root = self.get_logger(), self.config.node.map_directory
+        found = read_newest(session, root, logger.warning)
+        if found is None:
+            logger.info(f"no map to resume in '{root}'; starting with an empty one")
+            return
+        name, semantic_map, info = found
+        session.worker.restore(semantic_map, info.stamp_ns, info.camera_poses).result()
+        logger.info(f"resumed map '{name}': {semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances")
+
+    def _forget_inputs(self) -> None:
+        inputs = self._inputs
+        if inputs is not None:
+            inputs.reset()
+
+    def problems(self) -> list[str]:
+        """What is wrong, in words; nothing unless the node is active."""
+        watch = self._watch
+        return [problem.sentence for problem in watch.problems()] if watch is not None else []
+
+    def _arrived(self, topic: str, stamp_ns: int) -> None:
+        watch = self._watch
+        if watch is not None:  # It comes a moment after the inputs that it watches.
+            watch.arrived(topic, stamp_ns)
+
+    def _log_line(self) -> tuple[str, object]:
+        """A line for the log, and what has to change before there is another: not the seconds that a problem lasts."""
+        if self.session is None:
+            return self.state, self.state
+        watch, status = self._watch, self.status()
+        problems = watch.problems() if watch is not None else []
+        return "; ".join([status, *(each.sentence for each in problems)]), (status, [each.kind for each in problems])
 
     def _read_config(self) -> Config:
         return self.config
 
     def _apply_config(self, config: Config) -> None:
         self.config = config
+        self._status.follow(config)
+        session = self.session
+        if session is not None:
+            session.worker.between_frames(lambda: session.pipeline.reconfigure(config), changes=False)
+        if self._outputs is not None:
+            self._outputs.follow(config)
+        if self.autosave is not None:
+            self.autosave.follow()
 
 
 def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config) -> int:
     """Run the node until SIGINT or SIGTERM, in a process of its own.
+
+    With ``node.autostart`` it is brought to map at once; otherwise it waits, unconfigured, for a lifecycle manager.
 
     Args:
         args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
@@ -128,29 +269,24 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
         if stray:
             raise ConfigError(f"unknown arguments: {' '.join(stray)}; ROS arguments follow --ros-args")
         node = MapperNode(make_pipeline)
-        executor = CallbackExecutor(_EXECUTOR_THREADS)
+        executor = CallbackExecutor()
         executor.add_node(node)
         # Python runs signal handlers in the main thread alone, and not while that waits inside the middleware.
-        ThreadPoolExecutor(1, "spin").submit(executor.spin).result()
+        spinning = ThreadPoolExecutor(1, "spin").submit(executor.spin_on, node.get_logger().error)
+        if node.config.node.autostart:
+            # While it spins: a manager or an operator can see the state while the models load.
+            node.bring_up()
+        spinning.result()
     except KeyboardInterrupt:
         pass
     except REFUSALS as error:
-        print(f"{NODE_NAME}: {error}", file=sys.stderr)
+        print(f"{NODE_NAME}: {one_line(error)}", file=sys.stderr)
         code = 1
     except Exception:
         traceback.print_exc()
         code = 1
     _shut_down(node, executor, code)
     return code
-
-
-class CallbackExecutor(MultiThreadedExecutor):
-    """A multi-threaded executor that can be ended without cutting callbacks off."""
-
-    def finish(self, timeout_s: float) -> bool:
-        """Start no more callbacks; whether those in work were done within the time."""
-        self.shutdown()
-        return bool(self._work_tracker.wait(timeout_s))
 
 
 def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, code: int) -> None:

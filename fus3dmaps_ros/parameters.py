@@ -1,4 +1,4 @@
-"""ROS parameters from the configuration schema: declared once, with description, bounds and read-only flag."""
+"""ROS parameters from the configuration schema: declared once, with description, bounds, and when they can change."""
 
 from __future__ import annotations
 
@@ -17,8 +17,31 @@ from rclpy.parameter import Parameter
 from fus3dmaps_core.config import Config, fields
 from fus3dmaps_core.errors import ConfigError
 
-RUNTIME = frozenset({"query.top_k", "query.min_voxels"})
-"""Keys that can be changed while the node runs; all others shape the map or the graph and are read-only."""
+RUNTIME = frozenset(
+    {
+        "segmenter.min_area_px",
+        "segmenter.max_border_contact",
+        "segmenter.max_masks",
+        "keyframes.dense_translation_m",
+        "keyframes.dense_rotation_rad",
+        "keyframes.instance_translation_m",
+        "keyframes.instance_rotation_rad",
+        "map.memory_budget_mib",
+        "fusion.period_frames",
+        "query.top_k",
+        "query.min_voxels",
+        "node.publish_period_s",
+        "node.status_period_s",
+        "node.service_timeout_s",
+        "node.map_directory",
+        "node.autosave_period_s",
+    }
+)
+"""Keys that can be changed at any time. All others shape the models, the map or the graph, and can be changed while the node
+is unconfigured."""
+
+FIXED = frozenset({"node.autostart"})
+"""Keys that only matter at the start."""
 
 _TYPES = {
     bool: Parameter.Type.BOOL,
@@ -27,6 +50,7 @@ _TYPES = {
     str: Parameter.Type.STRING,
     list: Parameter.Type.DOUBLE_ARRAY,
 }
+_ARRAYS = (Parameter.Type.DOUBLE_ARRAY,)
 _INT64_MAX = 2**63 - 1
 
 
@@ -66,23 +90,38 @@ def unknown_overrides(node: Node) -> list[str]:
     return sentences
 
 
-def follow_changes(node: Node, read: Callable[[], Config], apply: Callable[[Config], None]) -> None:
+def follow_changes(
+    node: Node,
+    read: Callable[[], Config],
+    apply: Callable[[Config], None],
+    is_configured: Callable[[], bool] = lambda: True,
+) -> None:
     """Check parameters that are set at run time against the schema and hand on the new configuration.
 
     Args:
         node: Whose parameters to watch.
         read: Gives the configuration in force.
         apply: Takes the new one.
+        is_configured: Whether the node has models and a map, which parameters outside of RUNTIME would not fit any more.
     """
+    known = fields()
 
     def changed(parameters: list[Parameter]) -> Config:
-        return read().with_values({item.name: item.value for item in parameters if item.name in RUNTIME})
+        values = {item.name: list(item.value) if item.type_ in _ARRAYS else item.value for item in parameters}
+        return read().with_values({key: value for key, value in values.items() if key in known})
 
     def check(parameters: list[Parameter]) -> SetParametersResult:
         try:
-            changed(parameters)
+            new, present = changed(parameters).flat(), read().flat()
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        for key in known:
+            if new[key] != present[key] and key not in RUNTIME and is_configured():
+                return SetParametersResult(
+                    successful=False,
+                    reason=f"parameter '{key}' can be changed only while the node is unconfigured: deactivate and clean up"
+                    " first, or start the node with it",
+                )
         return SetParametersResult(successful=True)
 
     node.add_on_set_parameters_callback(check)
@@ -90,7 +129,7 @@ def follow_changes(node: Node, read: Callable[[], Config], apply: Callable[[Conf
 
 
 def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=field.description or "", read_only=key not in RUNTIME)
+    descriptor = ParameterDescriptor(description=field.description or "", read_only=key in FIXED)
     lower: float | None = None
     upper: float | None = None
     exclusive = []
@@ -107,7 +146,8 @@ def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
                 upper = limit  # type: ignore[assignment]
                 exclusive.append(f"< {limit}")
     # ROS ranges are closed; the schema refuses the open end itself.
-    descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive])
+    when = [] if key in RUNTIME | FIXED else ["changes only while the node is unconfigured"]
+    descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive, *when])
     if lower is None and upper is None:
         return descriptor
     if isinstance(field.default, int):

@@ -15,3 +15,8 @@ REFUSALS: tuple[type[Exception], ...] = (
     rclpy_implementation.UnknownROSArgsError,
 )
 """To be shown as one line, not as a traceback."""
+
+
+def one_line(error: Exception) -> str:
+    """The message of an error without line breaks, which those of the middleware have."""
+    return " ".join(str(error).split())

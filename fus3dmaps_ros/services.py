@@ -1,133 +1,90 @@
-"""The services ``~/query_text``, ``~/fuse`` and ``~/reset``. Whatever goes wrong is a reply, never an exception."""
+"""What all services have in common: a time limit, and that whatever goes wrong is a reply, never an exception."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from concurrent.futures import CancelledError
-from typing import Any
+from typing import Any, TypeVar
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from std_srvs.srv import Trigger
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from fus3dmaps_core.config import Config
-from fus3dmaps_core.errors import Fus3dmapsError, MapError
-from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import DEFAULT_LAYER, TextQuery, answer_query
-from fus3dmaps_msgs.srv import Fuse, QueryText
-from fus3dmaps_ros import conversions
-from fus3dmaps_ros.inputs import Inputs
-from fus3dmaps_ros.outputs import Outputs
-from fus3dmaps_ros.worker import FrameWorker
+from fus3dmaps_core.errors import Fus3dmapsError
+from fus3dmaps_ros.timed_calls import Deadline, TimedCalls
 
-_RESET_TIMEOUT_S = 30.0
+T = TypeVar("T")
+
+# The default keeps ten requests: of a hundred clients that ask at once, ninety would wait for ever.
+_QOS = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1000,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.VOLATILE,
+)
 
 
-class Services:
-    """Answers queries and commands while mapping goes on."""
+class Call:
+    """One call of a service, with the time that it has."""
 
-    def __init__(
-        self,
-        node: Node,
-        pipeline: Pipeline,
-        worker: FrameWorker,
-        inputs: Inputs,
-        outputs: Outputs,
-        read: Callable[[], Config],
-    ) -> None:
-        """Offer the services.
+    def __init__(self, calls: TimedCalls, timeout_s: float) -> None:
+        """The time begins."""
+        self._calls = calls
+        self.deadline = Deadline(timeout_s)
+
+    def in_time(self, work: Callable[[], T], afterwards: str = "") -> T:
+        """The result of work that may take long, see :meth:`TimedCalls.run`."""
+        return self._calls.run(work, self.deadline, afterwards)
+
+
+class ServiceGroup:
+    """Offers services that wait neither for each other nor for mapping. Calls of one service take turns."""
+
+    def __init__(self, node: Node, read: Callable[[], Config]) -> None:
+        """Offer nothing yet.
 
         Args:
             node: Owner of the services.
-            pipeline: Its map and text encoder answer.
-            worker: The thread that feeds the pipeline.
-            inputs: Forgets what waits on a reset.
-            outputs: Publishes answers.
-            read: Gives the configuration in force.
+            read: Gives the configuration in force; ``node.service_timeout_s`` is the time that each call has.
         """
-        self._log_error = node.get_logger().error
-        self._pipeline = pipeline
-        self._worker = worker
-        self._inputs = inputs
-        self._outputs = outputs
+        self._node = node
         self._read = read
-        # Two groups: a reset that waits for the frame in work does not hold up queries. Within one, calls take turns,
-        # since text encoders need not be thread-safe.
-        queries, commands = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
-        self._services = [
-            node.create_service(QueryText, "~/query_text", self.query_text, callback_group=queries),
-            node.create_service(Fuse, "~/fuse", self.fuse, callback_group=commands),
-            node.create_service(Trigger, "~/reset", self.reset, callback_group=commands),
-        ]
+        self._services: list[Any] = []
 
-    def query_text(self, request: Any, response: Any) -> Any:
-        """Answer a text query; a threshold of 0 leaves nothing out, a top_k of 0 takes ``query.top_k``."""
+    def _offer(self, service_type: Any, name: str, answer: Callable[[Any, Any, Call], str]) -> None:
+        """Offer a service.
 
-        def answer() -> str:
-            settings = self._read().query
-            query = TextQuery(
-                list(request.prompts),
-                tuple(request.negative_prompts),
-                request.layer or DEFAULT_LAYER,
-                None if request.threshold == 0.0 else request.threshold,
-                request.top_k or settings.top_k,
-                settings.min_voxels,
-            )
-            query.check()
-            trio = self._pipeline.trio
-            # Before the map is read: what it holds may be newer than the stamp, never older.
-            header = self._outputs.header()
-            found = answer_query(self._pipeline.semantic_map, trio.text, query, trio.logit_scale)
-            response.instances = [conversions.to_instance(header, instance) for instance in found.instances]
-            response.similarity = conversions.to_similarity_cloud(header, found)
-            if request.publish:
-                self._outputs.publish_similarity(response.similarity)
-            return f"{len(found.instances)} instances and {len(found.points_m)} voxels of layer '{found.layer}'"
+        Args:
+            service_type: Its type; the response has ``success`` and ``message``.
+            name: Under the node's own name.
+            answer: Takes request, response and call, fills in the response and returns the message of success.
+        """
+        calls = TimedCalls(name)
 
-        return self._reply("query_text", response, answer)
-
-    def fuse(self, _: Any, response: Any) -> Any:
-        """Fuse the layers."""
-
-        def fuse() -> str:
-            if self._pipeline.semantic_map.voxel_count == 0:
-                raise MapError("the map is empty: nothing has been mapped yet")
-            report = self._pipeline.semantic_map.fuse()
-            response.instances, response.updated, response.voxels = report.instances, report.updated, report.voxels
-            response.duration = conversions.to_duration(report.duration_s)
-            return f"{report.updated} of {report.instances} instances fused anew in {report.duration_s:.3f} s"
-
-        return self._reply("fuse", response, fuse)
-
-    def reset(self, _: Any, response: Any) -> Any:
-        """Empty the map, once the frame in work is done."""
-
-        def reset() -> str:
-            self._inputs.reset()
-            done = self._worker.reset()
+        def reply(request: Any, response: Any) -> Any:
             try:
-                done.result(_RESET_TIMEOUT_S)
-            except TimeoutError:
-                done.cancel()
-                raise MapError(
-                    f"the frame in work was not done within {_RESET_TIMEOUT_S:.0f} s; the map is as it was"
-                ) from None
-            except CancelledError:
-                raise MapError("the node is shutting down") from None
-            self._outputs.clear_similarity()
-            return "the map is empty"
+                response.message = answer(request, response, Call(calls, self._read().node.service_timeout_s))
+                response.success = True
+            except Fus3dmapsError as error:
+                response = self._refusal(service_type, str(error))
+            except Exception as error:
+                # A defect, or a device that failed: the caller is told, the log has the details, the node lives on.
+                response = self._refusal(service_type, f"internal error: {type(error).__name__}: {error}")
+                self._node.get_logger().error(f"{name} failed\n{traceback.format_exc()}")
+            return response
 
-        return self._reply("reset", response, reset)
+        self._services.append(
+            self._node.create_service(
+                service_type,
+                f"~/{name}",
+                reply,
+                qos_profile=_QOS,
+                callback_group=MutuallyExclusiveCallbackGroup(),
+            )
+        )
 
-    def _reply(self, service: str, response: Any, work: Callable[[], str]) -> Any:
-        try:
-            response.message = work()
-            response.success = True
-        except Fus3dmapsError as error:
-            response.success, response.message = False, str(error)
-        except Exception as error:
-            # A defect, or a device that failed: the caller is told, the log has the details, the node lives on.
-            response.success, response.message = False, f"internal error: {type(error).__name__}: {error}"
-            self._log_error(f"{service} failed\n{traceback.format_exc()}")
-        return response
+    @staticmethod
+    def _refusal(service_type: Any, message: str) -> Any:
+        # A fresh one: what a failed call had filled in is no answer. Replacement keeps odd text out of the middleware.
+        return service_type.Response(success=False, message=message.encode("utf-8", "replace").decode())

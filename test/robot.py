@@ -12,20 +12,24 @@ import numpy as np
 import pytest
 import rclpy
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from stand_ins import ColorSegmenter, color_trio
 from std_msgs.msg import Header
 
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_ros.executor import CallbackExecutor
 from fus3dmaps_ros.inputs import input_qos
-from fus3dmaps_ros.mapper_node import CallbackExecutor, MapperNode
+from fus3dmaps_ros.mapper_node import MapperNode
+from fus3dmaps_ros.outputs import LATCHED
 
 TIMEOUT_S = 60.0
+RELIABLE_INPUTS = {f"input.{stream}_qos": "reliable" for stream in ("rgb", "depth", "camera_info", "pose")}
 
 
 def wait_until(condition: Callable[[], Any], what: str) -> Any:
@@ -79,11 +83,38 @@ def pose_message(frame: PosedFrame) -> PoseStamped:
     return message
 
 
+def pose_with_covariance_message(frame: PosedFrame) -> PoseWithCovarianceStamped:
+    stamped = pose_message(frame)
+    message = PoseWithCovarianceStamped(header=stamped.header)
+    message.pose.pose = stamped.pose
+    return message
+
+
+def odometry_message(frame: PosedFrame) -> Odometry:
+    stamped = pose_message(frame)
+    message = Odometry(header=stamped.header, child_frame_id="base_link")
+    message.pose.pose = stamped.pose
+    return message
+
+
+def compressed_message(stamp_ns: int, image_format: str, data: bytes) -> CompressedImage:
+    message = CompressedImage(header=header(stamp_ns), format=image_format)
+    message.data.frombytes(data)
+    return message
+
+
+POSES = {
+    "pose": (PoseStamped, "pose", pose_message),
+    "pose_with_covariance": (PoseWithCovarianceStamped, "pose_with_covariance", pose_with_covariance_message),
+    "odometry": (Odometry, "odom", odometry_message),
+}
+
+
 class CallbackThreads:
     """Runs the callbacks of nodes, each in threads of its own, for as long as the context lasts."""
 
     def __init__(self, context: Context, *nodes: Node) -> None:
-        self._executors = [CallbackExecutor(4, context=context) for _ in nodes]
+        self._executors = [CallbackExecutor(context=context) for _ in nodes]
         self._threads = [threading.Thread(target=executor.spin, daemon=True) for executor in self._executors]
         for executor, node in zip(self._executors, nodes, strict=True):
             executor.add_node(node)
@@ -103,15 +134,18 @@ _numbers = itertools.count()
 
 
 class Robot:
-    """A mapper node with stand-in models, and a second node that plays the camera and the user."""
+    """A mapper node with stand-in models, and a second node that plays the camera and the user.
+
+    It publishes what the parameters ask for: poses from the source, images in the transport. ``makers`` holds what makes the
+    message of each publisher from a frame; images in a transport other than raw need one from the test.
+    """
 
     def __init__(self, make_pipeline: Callable[[Any], Pipeline] = stand_in_pipeline, **parameters: Any) -> None:
-        self._odometry = parameters.get("input.pose_source") == "odometry"
         self.context = Context()
         rclpy.init(args=[], context=self.context)
         # Robots of several tests may live at the same time.
         self.namespace = f"/robot_{next(_numbers)}"
-        overrides = {"node.input_qos": "reliable", "node.publish_period_s": 0.1, "node.queue_size": 100, **parameters}
+        overrides = {**RELIABLE_INPUTS, "node.publish_period_s": 0.1, "node.queue_size": 100, **parameters}
         self.mapper = MapperNode(
             make_pipeline,
             context=self.context,
@@ -122,24 +156,30 @@ class Robot:
         self._threads = CallbackThreads(self.context, self.mapper, self.user)
         self._threads.__enter__()
         qos = input_qos("reliable", 100)
+        source = parameters.get("input.pose_source", "pose")
+        outlets = {"info": (CameraInfo, "rgb/camera_info", camera_info_message)}
+        if source in POSES:
+            outlets["pose"] = POSES[source]
+        for name, make in (("rgb", rgb_message), ("depth", depth_message)):
+            transport = parameters.get(f"input.{name}_transport", "raw")
+            raw = transport == "raw"
+            outlets[name] = (Image if raw else CompressedImage, f"{name}/image" + ("" if raw else f"/{transport}"), make)
+        self.makers: dict[str, Callable[[PosedFrame], Any]] = {name: make for name, (_, _, make) in outlets.items()}
         self.publishers = {
-            "rgb": self.user.create_publisher(Image, "rgb/image", qos),
-            "depth": self.user.create_publisher(Image, "depth/image", qos),
-            "info": self.user.create_publisher(CameraInfo, "rgb/camera_info", qos),
-            "pose": self.user.create_publisher(PoseStamped, "pose", qos),
+            name: self.user.create_publisher(message_type, topic, qos) for name, (message_type, topic, _) in outlets.items()
         }
-        expected = [outlet for name, outlet in self.publishers.items() if name != "pose" or not self._odometry]
-        wait_until(lambda: all(outlet.get_subscription_count() for outlet in expected), "inputs matched")
+        if parameters.get("node.autostart", True):
+            self.mapper.bring_up()
+            self.connect()
+
+    def connect(self) -> None:
+        """Wait until the camera's messages reach the node, which must be active."""
+        wait_until(lambda: all(outlet.get_subscription_count() for outlet in self.publishers.values()), "inputs matched")
 
     def show(self, frame: PosedFrame) -> None:
         """Publish all that belongs to a frame."""
-        for name, make in (
-            ("info", camera_info_message),
-            ("pose", pose_message),
-            ("rgb", rgb_message),
-            ("depth", depth_message),
-        ):
-            self.publishers[name].publish(make(frame))
+        for name, publisher in self.publishers.items():
+            publisher.publish(self.makers[name](frame))
 
     def map(self, frame: PosedFrame) -> None:
         """Publish a frame and wait until it is in the map."""
@@ -150,13 +190,19 @@ class Robot:
             lambda: worker.stamp_ns == frame.stamp_ns and worker.revision > revision, f"frame {frame.stamp_ns} mapped"
         )
 
-    def call(self, service_type: Any, name: str, **fields: Any) -> Any:
-        client = self.user.create_client(service_type, f"fus3dmaps/{name}")
-        assert client.wait_for_service(TIMEOUT_S), name
+    def call(self, service_type: Any, service: str, /, **fields: Any) -> Any:
+        client = self.user.create_client(service_type, f"fus3dmaps/{service}")
+        assert client.wait_for_service(TIMEOUT_S), service
         future = client.call_async(service_type.Request(**fields))
-        wait_until(future.done, f"reply of {name}")
+        wait_until(future.done, f"reply of {service}")
         self.user.destroy_client(client)
         return future.result()
+
+    def listen(self, message_type: Any, name: str) -> list[Any]:
+        """Messages of one of the node's own topics as they come."""
+        received: list[Any] = []
+        self.user.create_subscription(message_type, f"fus3dmaps/{name}", received.append, LATCHED)
+        return received
 
     def close(self) -> None:
         self._threads.__exit__()

@@ -102,6 +102,37 @@ def odometry(
     )
 
 
+def pose_with_covariance(
+    stamp_ns: int = 0,
+    position: Sequence[float] = (0.0, 0.0, 0.0),
+    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+    frame_id: str = "map",
+) -> Any:
+    return make(
+        "geometry_msgs/msg/PoseWithCovarianceStamped",
+        header(stamp_ns, frame_id),
+        make("geometry_msgs/msg/PoseWithCovariance", _pose(position, quaternion), np.zeros(36)),
+    )
+
+
+def compressed(stamp_ns: int, image_format: str, data: bytes) -> Any:
+    return make("sensor_msgs/msg/CompressedImage", header(stamp_ns), image_format, np.frombuffer(data, np.uint8))
+
+
+def transforms(*edges: tuple[Any, ...]) -> Any:
+    """A message of edges: parent, child, stamp, translation and, if it is turned, quaternion."""
+    stamped = []
+    for parent, child, stamp_ns, translation, *turn in edges:
+        quaternion = turn[0] if turn else (0.0, 0.0, 0.0, 1.0)
+        transform = make(
+            "geometry_msgs/msg/Transform",
+            make("geometry_msgs/msg/Vector3", *translation),
+            make("geometry_msgs/msg/Quaternion", *quaternion),
+        )
+        stamped.append(make("geometry_msgs/msg/TransformStamped", header(stamp_ns, parent), child, transform))
+    return make("tf2_msgs/msg/TFMessage", stamped)
+
+
 def _pose(position: Sequence[float], quaternion: Sequence[float]) -> Any:
     return make(
         "geometry_msgs/msg/Pose",

@@ -8,7 +8,7 @@ from torch import Tensor
 from fus3dmaps_core.kernels.protocols import Kernels, Pairs
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rounding import seeds_of
-from fus3dmaps_core.memory.rows import RowPool
+from fus3dmaps_core.memory.rows import RowPool, shortened
 
 
 class DenseLayer:
@@ -38,6 +38,10 @@ class DenseLayer:
     def row_of_slot(self, slots: slice) -> Tensor:
         """Row of each slot, -1 where a voxel has no dense embedding: (n,) int32, not a copy."""
         return self._row_of_slot[slots]
+
+    def slots(self, rows: Tensor) -> Tensor:
+        """Slot of each row, -1 for a free one: (n,) int64."""
+        return self._slot_of_row[rows].to(torch.int64)
 
     def slot_of_row(self) -> Tensor:
         """Slot of every row ever given, -1 for a free one: (rows,) int32, not a copy."""
@@ -98,11 +102,53 @@ class DenseLayer:
         self._weight_of_row[rows] = 0.0
         self.pool.free(rows)
 
+    def least_observed(self, count: int) -> Tensor:
+        """Rows of the ``count`` lowest weights, of equal ones those of the lowest slots: (count,) int64.
+
+        Args:
+            count: At most as many as there are voxels with a dense embedding.
+        """
+        rows, slots = self.live()
+        if count >= len(rows):
+            return rows
+        if not count:
+            return rows[:0]
+        weights = self._weight_of_row[rows]
+        limit = torch.kthvalue(weights, count).values
+        below, level = rows.masked_select(weights < limit), weights == limit
+        level_rows, level_slots = rows.masked_select(level), slots.masked_select(level)
+        oldest = torch.sort(level_slots).indices[: count - len(below)]
+        return torch.cat([below, level_rows.index_select(0, oldest)])
+
+    def compact(self) -> None:
+        """Move embeddings together and give back the blocks that are then empty; nothing that is known changes."""
+        count = len(self.pool)
+        if self.pool.spare_blocks:
+            used = self.slot_of_row() >= 0
+            sources = count + torch.nonzero(used[count:]).squeeze(1)
+            targets = torch.nonzero(~used[:count]).squeeze(1)
+            slots = self._slot_of_row[sources]
+            self.pool.move(sources, targets)
+            self._slot_of_row[targets] = slots
+            self._weight_of_row[targets] = self._weight_of_row[sources]
+            self._row_of_slot[slots.to(torch.int64)] = targets.to(torch.int32)
+            self._slot_of_row = shortened(self._slot_of_row, count, -1)
+            self._weight_of_row = shortened(self._weight_of_row, count, 0.0)
+            self.pool.truncate(count)
+
     def admit(self, slots: Tensor, weights: Tensor) -> Tensor:
         """Give slots without a dense embedding a row of the weights (n,): (n,) int64 rows, whose means are undefined."""
         rows = self._rows_for(slots)
         self._weight_of_row[rows] = weights
         return rows
+
+    @property
+    def block_nbytes(self) -> int:
+        """Most bytes that the embeddings of one block take, with columns that have just doubled."""
+        scale = 4 if self.pool.dtype == torch.int8 else 0
+        columns = 2 * (4 + 4 + 4 + scale)  # Slot, weight and, if it is free, the number of a row.
+        addresses = 16 * 8  # There is room for as many at least.
+        return self.pool.block_rows * (self.pool.dimension * self.pool.dtype.itemsize + columns) + addresses
 
     @property
     def link_nbytes(self) -> int:

@@ -14,6 +14,16 @@ from fus3dmaps_core.memory.numbers import Numbers
 from fus3dmaps_core.memory.rounding import to_half, to_int8
 
 _BLOCK_ROWS = {"cpu": 1024, "cuda": 32768}  # A CPU visits blocks in cache-sized steps, a GPU wants few launches.
+_MOVED_ROWS = 1024
+
+
+def shortened(column: Column, count: int, fill: int | float) -> Column:
+    """A column of one value a row that takes no more than the first ``count`` rows of another need, and holds those."""
+    kept = column[:count]
+    short = Column(kept.dtype, fill, kept.device)
+    short.reserve(count)
+    short[:count] = kept
+    return short
 
 
 class RowPool:
@@ -49,6 +59,11 @@ class RowPool:
         return self._numbers.high_water
 
     @property
+    def spare_blocks(self) -> int:
+        """Blocks that could be given back if the rows in use were moved together."""
+        return len(self.blocks) - -(-len(self) // self.block_rows)
+
+    @property
     def nbytes(self) -> int:
         """Allocated bytes."""
         values = sum(block.numel() * block.element_size() for block in self.blocks)
@@ -74,6 +89,20 @@ class RowPool:
     def free(self, rows: Tensor) -> None:
         """Give rows back; each must be in use and appear once."""
         self._numbers.give_back(rows)
+
+    def move(self, sources: Tensor, targets: Tensor) -> None:
+        """Copy the values of rows to other rows as they are stored: two (n,) int64 without a row in common."""
+        for some, places in zip(torch.split(sources, _MOVED_ROWS), torch.split(targets, _MOVED_ROWS), strict=True):
+            self.write_stored(places, *self.read_stored(some))
+
+    def truncate(self, count: int) -> None:
+        """Have rows 0 .. count - 1 in use and no others, and give back the blocks and columns beyond them."""
+        self._numbers = Numbers("embeddings", self._device)
+        self._numbers.take(count)
+        del self.blocks[-(-count // self.block_rows) :]
+        self.addresses[len(self.blocks) :] = 0
+        if self.dtype == torch.int8:
+            self.scales = shortened(self.scales, count, 0.0)
 
     def read(self, rows: Tensor) -> Tensor:
         """Values of the rows: (n, d) float32."""

@@ -23,6 +23,14 @@ from fus3dmaps_core.messages import transform_from
 CAMERA_FRAME = "camera_optical_frame"
 
 _COMPRESSIONS = {"lz4": CompressionType.LZ4, "zstd": CompressionType.ZSTD, "none": CompressionType.NONE}
+_WRITTEN = {
+    "cameras": "",
+    "rgb_transport": "raw",
+    "depth_transport": "raw",
+    "depth_registered": True,
+    "pose_source": "pose",
+    "extrinsic_source": "parameter",
+}
 _MAX_DEPTH_MM = 65534.0  # Some readers take 65535 for "no reading".
 _OFFERED_QOS = """\
 - history: keep_last
@@ -73,9 +81,13 @@ class RecordingWriter:
 
         Raises:
             RecordingError: The name is unsuitable, the file exists or cannot be written.
-            ConfigError: ``input.T_body_camera`` is not a pose.
+            ConfigError: ``input.T_body_camera`` is not a pose, or the configuration asks for inputs of another kind than
+                what is written; the message names the parameter.
         """
         self._config = config or InputConfig()
+        for name, value in _WRITTEN.items():
+            if getattr(self._config, name) != value:
+                raise ConfigError(f"parameter 'input.{name}': a recording can only be written with {value!r}")
         try:
             self._T_camera_body = np.linalg.inv(transform_from(self._config.T_body_camera))
         except FrameError as error:

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 from fus3dmaps_core.config import InputConfig
 from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.storage import TopicSummary
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
+from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_core.sources.transforms import TransformTree
+
+_TF_TYPE = "tf2_msgs/msg/TFMessage"
+_TF_TOPICS = ("/tf", "/tf_static")
 
 
 class BagSource:
     """Reads the topics that the configuration names from a recording and pairs them as the live node does.
 
-    Topic names match with or without their leading slash. Use it as a context manager; each iteration starts anew.
+    Topic names match with or without their leading slash. TF is what the recording holds on ``/tf`` and ``/tf_static``. Use
+    it as a context manager; each iteration starts anew.
 
     Attributes:
         pairer: Counts what the current (or last) iteration received and dropped.
@@ -33,26 +40,21 @@ class BagSource:
             ConfigError: As :class:`FramePairer`.
         """
         self._config = config
-        self.pairer = FramePairer(config)
+        self.pairer, _ = self._new_pairer()
         self.messages_read = 0
         self._reader = RecordingReader(path)
         try:
-            self._rgb = self._require("rgb_topic", "sensor_msgs/msg/Image")
-            self._depth = self._require("depth_topic", "sensor_msgs/msg/Image")
-            self._camera_info = self._require("camera_info_topic", "sensor_msgs/msg/CameraInfo")
-            if config.pose_source == "pose":
-                self._pose = self._require("pose_topic", "geometry_msgs/msg/PoseStamped")
-            else:
-                self._pose = self._require("odometry_topic", "nav_msgs/msg/Odometry")
+            inputs = [(stream.parameter, self._require(stream)) for stream in self.pairer.streams()]
+            transforms = self._require_tf() if uses_tf(config) else []
         except RecordingError:
             self._reader.close()
             raise
-        self._inputs = {input_.topic: input_ for input_ in (self._rgb, self._depth, self._camera_info, self._pose)}
-        self.messages_total = sum(input_.count for input_ in self._inputs.values())
+        self._frames = sum(found.count for parameter, found in inputs if parameter == "input.rgb_topic")
+        self.messages_total = sum(found.count for found in [*(found for _, found in inputs), *transforms])
 
     def __len__(self) -> int:
         """Colour images in the recording, each of which becomes at most one frame."""
-        return self._rgb.count
+        return self._frames
 
     @property
     def duration_s(self) -> float:
@@ -65,16 +67,11 @@ class BagSource:
         Raises:
             RecordingError: After everything readable was delivered, if the recording is damaged.
         """
-        self.pairer = pairer = FramePairer(self._config)
+        self.pairer, add = self._new_pairer()
+        pairer = self.pairer
         self.messages_read = 0
-        add = {
-            self._rgb.topic: pairer.add_rgb,
-            self._depth.topic: pairer.add_depth,
-            self._camera_info.topic: pairer.add_camera_info,
-            self._pose.topic: pairer.add_pose,
-        }
         damage: RecordingError | None = None
-        messages = self._reader.messages(self._inputs)
+        messages = self._reader.messages(add)
         while True:
             try:
                 raw = next(messages, None)
@@ -109,10 +106,18 @@ class BagSource:
         """Release the files."""
         self.close()
 
-    def _require(self, parameter: str, msgtype: str) -> TopicSummary:
-        topic = "/" + str(getattr(self._config, parameter)).lstrip("/")
-        topics = self._reader.topics
-        found = topics.get(topic)
+    def _new_pairer(self) -> tuple[FramePairer, dict[str, Callable[[Any], None]]]:
+        """A pairer, and what takes the messages of each topic of the recording for it."""
+        tree = TransformTree(self._config.max_pose_gap_s) if uses_tf(self._config) else None
+        pairer = FramePairer(self._config, tree)
+        add = {_absolute(stream.topic): stream.add for stream in pairer.streams()}
+        if tree is not None:
+            add |= {topic: _transform_adder(tree, pairer, topic) for topic in _TF_TOPICS}
+        return pairer, add
+
+    def _require(self, stream: InputStream) -> TopicSummary:
+        topic, msgtype = _absolute(stream.topic), stream.msgtype
+        found = self._reader.topics.get(topic)
         if found is not None and found.msgtype == msgtype and found.count > 0:
             return found
         if found is None:
@@ -121,8 +126,29 @@ class BagSource:
             problem = f"holds no messages on topic '{topic}'"
         else:
             problem = f"holds {found.msgtype} on topic '{topic}', not {msgtype}"
-        listing = ", ".join(f"{t.topic} ({t.msgtype}, {t.count} messages)" for t in topics.values())
+        raise self._refusal(f"{problem} (parameter '{stream.parameter}')")
+
+    def _require_tf(self) -> list[TopicSummary]:
+        topics = self._reader.topics
+        found = [topics[name] for name in _TF_TOPICS if name in topics and topics[name].msgtype == _TF_TYPE]
+        if not any(summary.count for summary in found):
+            source = "pose_source" if self._config.pose_source == "tf" else "extrinsic_source"
+            raise self._refusal(f"holds no transforms on '/tf' or '/tf_static' (parameter 'input.{source}')")
+        return found
+
+    def _refusal(self, problem: str) -> RecordingError:
+        listing = ", ".join(f"{t.topic} ({t.msgtype}, {t.count} messages)" for t in self._reader.topics.values())
         damage = f"; it is truncated or damaged ({self._reader.damage})" if self._reader.damage else ""
-        raise RecordingError(
-            f"recording '{self._reader.path}' {problem} (parameter 'input.{parameter}'); it has {listing}{damage}"
-        )
+        return RecordingError(f"recording '{self._reader.path}' {problem}; it has {listing}{damage}")
+
+
+def _absolute(topic: str) -> str:
+    return "/" + topic.lstrip("/")
+
+
+def _transform_adder(tree: TransformTree, pairer: FramePairer, topic: str) -> Callable[[Any], None]:
+    def add(message: Any) -> None:
+        for refused in tree.add(message, topic, static=topic == "/tf_static"):
+            pairer.drop(refused)
+
+    return add

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from stand_ins import ColorSegmenter, color_trio, wall_frame
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.query import TextQuery, answer_query
 
@@ -95,6 +100,120 @@ def test_a_window_bounds_the_dense_layer_and_keeps_instances():
     assert not voxels.dense_weight[far].any()
     assert semantic_map.dense_voxel_count < semantic_map.voxel_count / 2
     assert ask(pipeline, "red", "fused_instances").instances[0].centroid_m == pytest.approx([-0.4, 0.0, 2.0], abs=0.06)
+
+
+MIB, BUDGET_MIB = 2**20, 1.7
+FEW = {"sampling__dense_per_patch": 1, "sampling__instance_per_patch": 1, "map__dtype": "float32"}
+
+
+def drive(pipeline: Pipeline, frames: int = 70, step_m: float = 0.3):
+    """Along a wall with a red square at its start and a blue one at its end; yields what became of each frame."""
+    squares = {"red": (-0.4, 0.0, 0.4), "blue": (step_m * (frames - 1) + 0.2, 0.0, 0.4)}
+    for i in range(frames):
+        yield pipeline.process(wall_frame(i, x_m=step_m * i, patches=squares))
+
+
+def allocated_mib(pipeline: Pipeline) -> float:
+    return sum(pipeline.semantic_map.nbytes().values()) / MIB
+
+
+def test_a_small_budget_costs_dense_voxels_and_nothing_else(caplog: pytest.LogCaptureFixture):
+    free, bound = make(**FEW), make(map__memory_budget_mib=BUDGET_MIB, **FEW)
+    assert sum(report.dropped_dense_voxels for report in drive(free)) == 0
+    assert allocated_mib(free) > BUDGET_MIB
+    dropped = 0
+    with caplog.at_level(logging.WARNING):
+        for report in drive(bound):
+            assert allocated_mib(bound) <= BUDGET_MIB
+            assert (report.dense, report.instances, report.window_radius_m) == (True, True, 0.0)
+            dropped += report.dropped_dense_voxels
+    missing = free.semantic_map.dense_voxel_count - bound.semantic_map.dense_voxel_count
+    assert dropped >= missing > 1000  # What was dropped in front of the camera was seen and dropped again.
+    assert [record.name for record in caplog.records] == ["fus3dmaps_core.memory_budget"]
+    mine, full = bound.semantic_map.export_state(), free.semantic_map.export_state()
+    for name in full:
+        if name.startswith(("instance", "hypothesis", "voxel")):
+            assert mine[name].tobytes() == full[name].tobytes(), name
+    for prompt, x in (("red", -0.4), ("blue", 20.9)):
+        assert ask(bound, prompt, "fused_instances").instances[0].centroid_m == pytest.approx([x, 0.0, 2.0], abs=0.06)
+    assert ask(bound, "blue", "dense").instances[0].centroid_m == pytest.approx([20.9, 0.0, 2.0], abs=0.06)
+
+
+def test_with_a_window_the_budget_takes_from_its_radius():
+    pipeline = make(map__memory_budget_mib=BUDGET_MIB, fusion__window_radius_m=20.0, **FEW)
+    reports = list(drive(pipeline))
+    assert reports[0].window_radius_m == 20.0
+    assert 1.0 <= reports[-1].window_radius_m < 20.0
+    assert pipeline.semantic_map.window_radius_m == reports[-1].window_radius_m
+    assert sum(report.dropped_dense_voxels for report in reports) > 0
+    assert allocated_mib(pipeline) <= BUDGET_MIB
+    not_a_keyframe = pipeline.process(wall_frame(99, x_m=0.3 * 69))
+    assert not not_a_keyframe.dense
+    assert not_a_keyframe.window_radius_m == reports[-1].window_radius_m
+    pipeline.reset()
+    assert pipeline.process(wall_frame(0)).window_radius_m == 20.0
+
+
+class ShortOfMemory:
+    """A crop encoder that has room for so many masks at once."""
+
+    def __init__(self, encoder, room: int) -> None:
+        self.encoder, self.room = encoder, room
+        self.sizes: list[int] = []
+
+    def encode_crops(self, rgb: np.ndarray, masks: Masks) -> np.ndarray:
+        self.sizes.append(len(masks))
+        if len(masks) > self.room:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+        return self.encoder.encode_crops(rgb, masks)
+
+
+def with_crop_memory(room: int) -> Pipeline:
+    trio = color_trio()
+    return Pipeline(Config(), replace(trio, crop=ShortOfMemory(trio.crop, room)), ColorSegmenter())
+
+
+SQUARES = {name: (x, 0.0, 0.25) for name, x in zip(["red", "green", "blue", "yellow"], [-0.6, -0.2, 0.2, 0.6], strict=True)}
+
+
+def test_crops_are_encoded_in_smaller_batches_when_memory_is_short():
+    ample, short = with_crop_memory(100), with_crop_memory(2)
+    for pipeline in (ample, short):
+        for i in range(3):
+            assert pipeline.process(wall_frame(i, x_m=0.2 * i, patches=SQUARES)).proposals >= 4
+    assert len(ample.trio.crop.sizes) == 3
+    assert max(short.trio.crop.sizes[2:]) <= 2
+    mine, full = short.semantic_map.export_state(), ample.semantic_map.export_state()
+    assert all(mine[name].tobytes() == full[name].tobytes() for name in full)
+
+
+def test_a_crop_encoder_without_any_memory_is_named_and_the_map_stays_within_its_budget():
+    pipeline = with_crop_memory(0)
+    with pytest.raises(EncoderError, match="crop encoder of 'stand_in'"):
+        pipeline.process(wall_frame(0))
+    assert pipeline.semantic_map.instance_count == 0
+    trio = color_trio()
+    values = {key.replace("__", "."): value for key, value in FEW.items()} | {"map.memory_budget_mib": BUDGET_MIB}
+    failing = Pipeline(Config.from_flat(values), replace(trio, crop=ShortOfMemory(trio.crop, 0)), ColorSegmenter())
+    for i in range(70):
+        with pytest.raises(EncoderError):
+            failing.process(wall_frame(i, x_m=0.3 * i, patches={"red": (0.3 * i, 0.0, 0.4)}))
+        assert allocated_mib(failing) <= BUDGET_MIB
+
+
+@pytest.mark.parametrize("part", ["patch", "segmenter"])
+def test_models_that_are_out_of_memory_are_named(part: str, monkeypatch: pytest.MonkeyPatch):
+    def fail(*_: object) -> None:
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory.")
+
+    pipeline = make()
+    model, method, name = {
+        "patch": (pipeline.trio.patch, "encode_patches", "patch encoder of 'stand_in'"),
+        "segmenter": (pipeline._segmenter, "segment", "segmenter 'lite'"),
+    }[part]
+    monkeypatch.setattr(model, method, fail)
+    with pytest.raises(EncoderError, match=name):
+        pipeline.process(wall_frame(0))
 
 
 def test_two_runs_are_equal_bit_for_bit():

@@ -20,7 +20,9 @@ from reference.agreement import (
     reference_of,
 )
 from reference.steps import (
+    DropStep,
     FuseStep,
+    ReleaseStep,
     Setting,
     dense_step,
     embeddings_of,
@@ -32,6 +34,7 @@ from reference.steps import (
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.layers.similarity import LAYERS
 from fus3dmaps_core.query import TextQuery
 from fus3dmaps_core.semantic_map import SemanticMap
@@ -102,6 +105,7 @@ def test_agrees_with_the_reference_over_a_long_walk_that_takes_every_branch(sett
     sometimes = {"match_tie", "proposal_without_point", "removed_dense", "removed_hypotheses", "instance_removed"}
     if setting.window_radius_m > 0:
         often |= {"window_dropped", "dense_revisit", "fusion_kept"}
+    sometimes |= {"least_observed_dropped", "least_observed_tie"}
     if setting.max_hypotheses > 1:
         often.add("hypothesis_pruned_tie")
     assert {branch: reference.seen[branch] for branch in often if reference.seen[branch] < 10} == {}
@@ -125,6 +129,33 @@ def test_agrees_with_the_reference_when_storage_grows_past_its_first_blocks(back
     assert_same_map(engine, reference, setting)
     texts = KnownTexts({"mug": np.array([0.2, 0.9, -0.1])})
     assert_same_answer(engine, reference, setting, TextQuery(["mug"], layer="fused_dense"), texts, logit_scale=1.0)
+
+
+@on_every_backend
+@in_every_dtype
+def test_agrees_with_the_reference_when_most_of_its_storage_was_given_back(dtype: str, backend: str, device: str):
+    setting = Setting(dimension=3, dtype=dtype, backend=backend, device=device)
+    rng = np.random.default_rng(5)
+    engine, reference = engine_of(setting), reference_of(setting)
+    keys = [(x - 9, y - 7, z - 9) for x, y, z in np.ndindex(17, 15, 18)]
+    seen_again = [keys[int(each)] for each in rng.integers(0, len(keys), 6000)]
+    apply_to_both(dense_step(keys + seen_again, setting, rng), engine, reference)
+    apply_to_both(proposal_step([keys[:200]], setting, rng), engine, reference)
+    before = engine.nbytes()["dense"]
+    apply_to_both(DropStep(4000), engine, reference)
+    assert engine.nbytes()["dense"] >= before, "rows alone were freed, blocks stay"
+    assert_same_map(engine, reference, setting)
+    state = engine.export_state()
+    if device == "cpu":
+        assert before / 5 > engine.nbytes()["dense"] - engine.release_unused()
+    ReleaseStep().apply(engine)
+    assert_same_bytes(engine.export_state(), state)
+    assert engine.release_unused() == 0
+    apply_to_both(FuseStep(), engine, reference)
+    apply_to_both(dense_step(keys[::3] + seen_again, setting, rng), engine, reference)
+    apply_to_both(FuseStep(), engine, reference)
+    assert_same_map(engine, reference, setting)
+    ask_everything(engine, reference, setting, 5)
 
 
 @on_every_backend
@@ -190,6 +221,72 @@ def test_the_window_drops_what_is_farther_and_keeps_the_rest():
     assert engine.dense_voxel_count == 3
     assert engine.voxel_count == 4
     assert engine.prune_window(np.array([0.25, 0.25, 0.25])) == 0
+
+
+def observe(engine: SemanticMap, numbers: list[int]) -> None:
+    """One point in each of the voxels, which lie side by side along x and are named by their number."""
+    points_m = (np.array(numbers)[:, None] * [1.0, 0.0, 0.0] + 0.5) * engine.config.voxel_size_m
+    count = len(numbers)
+    engine.integrate_dense(points_m, np.zeros(count, int), np.ones((1, 5)), np.ones(1), np.zeros((count, 3), np.uint8))
+
+
+def observed(engine: SemanticMap) -> list[int]:
+    """Numbers of the voxels with a dense embedding."""
+    state = engine.export_state()
+    return sorted(state["voxel_coordinates"][state["dense_slot"], 0].tolist())
+
+
+@on_every_backend
+def test_the_least_observed_voxels_are_dropped_the_oldest_of_equals_first(backend: str, device: str):
+    engine = engine_of(Setting(backend=backend, device=device))
+    for numbers in ([9], [4], [7, 4], [2], [4]):  # Seen once: 9, 7, 2 in this order; thrice: 4.
+        observe(engine, numbers)
+    assert engine.drop_least_observed(0) == 0
+    assert engine.drop_least_observed(1) == 1
+    assert observed(engine) == [2, 4, 7]
+    assert engine.drop_least_observed(2) == 2
+    assert observed(engine) == [4]
+    observe(engine, [9, 9, 9, 9])
+    assert engine.drop_least_observed(1) == 1
+    assert observed(engine) == [9]
+    assert engine.drop_least_observed(100) == 1
+    assert (engine.dense_voxel_count, engine.voxel_count, engine.drop_least_observed(1)) == (0, 4, 0)
+
+
+def test_a_negative_count_is_refused():
+    engine = engine_of(Setting())
+    observe(engine, [1])
+    with pytest.raises(MapError, match="count"):
+        engine.drop_least_observed(-1)
+    assert observed(engine) == [1]
+
+
+def test_the_windows_radius_can_change_until_the_map_is_emptied():
+    engine = engine_of(Setting(voxel_size_m=0.5, window_radius_m=5.0))
+    observe(engine, list(range(10)))
+    center_m = np.array([0.25, 0.25, 0.25])
+    assert engine.prune_window(center_m) == 0
+    engine.set_window_radius(1.0)
+    assert engine.window_radius_m == 1.0
+    assert engine.prune_window(center_m) == 7
+    assert observed(engine) == [0, 1, 2]
+    engine.reset()
+    assert engine.window_radius_m == 5.0
+
+
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_radius_that_is_none_is_refused(radius_m: float):
+    engine = engine_of(Setting(window_radius_m=0.16))
+    with pytest.raises(MapError, match="radius_m"):
+        engine.set_window_radius(radius_m)
+    assert engine.window_radius_m == 0.16
+
+
+def test_a_map_without_a_window_gets_none():
+    engine = engine_of(Setting())
+    with pytest.raises(MapError, match="without a window"):
+        engine.set_window_radius(1.0)
+    assert engine.window_radius_m == 0.0
 
 
 def test_points_belong_to_their_voxel_kilometres_away_and_at_its_walls():

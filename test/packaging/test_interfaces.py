@@ -6,10 +6,37 @@ import re
 
 import pytest
 
-from fus3dmaps_msgs.msg import SemanticInstance
-from fus3dmaps_msgs.srv import Fuse, QueryText
+from fus3dmaps_msgs.msg import MapperStatus, SemanticInstance
+from fus3dmaps_msgs.srv import Fuse, LabelMap, ListInstances, LoadMap, QueryImage, QueryText, SaveMap
 
 PROMISED = {
+    MapperStatus: {
+        "header": "std_msgs/Header",
+        "state": "string",
+        "topics": "sequence<string>",
+        "rates_hz": "sequence<float>",
+        "frames": "uint64",
+        "not_keyframes": "uint64",
+        "dense_keyframes": "uint64",
+        "instance_keyframes": "uint64",
+        "drop_reasons": "sequence<string>",
+        "drop_counts": "sequence<uint64>",
+        "queue_depth": "uint32",
+        "queue_size": "uint32",
+        "stages": "sequence<string>",
+        "stage_mean_ms": "sequence<float>",
+        "stage_max_ms": "sequence<float>",
+        "voxels": "uint64",
+        "dense_voxels": "uint64",
+        "instances": "uint32",
+        "parts": "sequence<string>",
+        "part_bytes": "sequence<uint64>",
+        "memory_budget_bytes": "uint64",
+        "gpu_bytes": "uint64",
+        "autosaves": "uint64",
+        "failed_autosaves": "uint64",
+        "problems": "sequence<string>",
+    },
     SemanticInstance: {
         "header": "std_msgs/Header",
         "id": "uint32",
@@ -35,6 +62,32 @@ PROMISED = {
         "instances": "sequence<fus3dmaps_msgs/SemanticInstance>",
         "similarity": "sensor_msgs/PointCloud2",
     },
+    QueryImage.Request: {
+        "image": "sensor_msgs/Image",
+        "negative_prompts": "sequence<string>",
+        "layer": "string",
+        "threshold": "float",
+        "top_k": "uint32",
+        "publish": "boolean",
+    },
+    QueryImage.Response: {
+        "success": "boolean",
+        "message": "string",
+        "instances": "sequence<fus3dmaps_msgs/SemanticInstance>",
+        "similarity": "sensor_msgs/PointCloud2",
+    },
+    LabelMap.Request: {"labels": "sequence<string>", "layer": "string", "publish": "boolean"},
+    LabelMap.Response: {"success": "boolean", "message": "string", "cloud": "sensor_msgs/PointCloud2"},
+    ListInstances.Request: {"min_voxels": "uint32"},
+    ListInstances.Response: {
+        "success": "boolean",
+        "message": "string",
+        "instances": "sequence<fus3dmaps_msgs/SemanticInstance>",
+    },
+    SaveMap.Request: {"name": "string"},
+    SaveMap.Response: {"success": "boolean", "message": "string", "path": "string", "bytes": "uint64"},
+    LoadMap.Request: {"name": "string"},
+    LoadMap.Response: {"success": "boolean", "message": "string", "voxels": "uint64", "instances": "uint32"},
     Fuse.Request: {},
     Fuse.Response: {
         "success": "boolean",
@@ -55,7 +108,7 @@ def test_fields_are_those_promised(interface):
 def test_every_interface_file_is_built_and_every_field_explained(root):
     build = (root / "fus3dmaps_msgs" / "CMakeLists.txt").read_text()
     files = [*(root / "fus3dmaps_msgs").rglob("*.msg"), *(root / "fus3dmaps_msgs").rglob("*.srv")]
-    assert len(files) == 3
+    assert len(files) == 9
     for path in files:
         assert f'"{path.relative_to(root / "fus3dmaps_msgs").as_posix()}"' in build
         explained = False

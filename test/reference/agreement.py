@@ -15,7 +15,7 @@ from fus3dmaps_core.semantic_map import SemanticMap
 from reference.objects import box_m, centroid_m, occupied_voxels
 from reference.queries import layer_embeddings, ranking, similarity_of_voxels
 from reference.semantic_map import Fusion, ReferenceMap
-from reference.steps import Setting, Step
+from reference.steps import DropStep, Setting, Step
 from reference.vectors import Key, center_of, voxel_of
 
 FLOAT32_TOLERANCE = 2e-5
@@ -55,6 +55,8 @@ def reference_of(setting: Setting) -> ReferenceMap:
 
 def apply_to_both(step: Step, engine: SemanticMap, reference: ReferenceMap) -> None:
     """Take one step with both; what they return must be the same (ids, dropped and removed voxels, fused instances)."""
+    if isinstance(step, DropStep):
+        reference.slot_order = keys_of(engine.export_state()["voxel_coordinates"])
     expected, got = step.apply(reference), step.apply(engine)
     if isinstance(expected, list):
         assert got.dtype == np.int64

@@ -36,6 +36,7 @@ class ReferenceMap:
     ``seen`` counts the branches that were taken, so that a test can tell whether its sequence reached them.
     ``dense_roundings`` is how many roundings a dense mean of low precision may be off by: each write adds at most one, and
     those before it weigh as much as the mean that they are in. ``most_dense_roundings`` is the largest there ever was.
+    ``slot_order`` is the order of slots of the map that this is compared with, which decides between voxels of equal weight.
     """
 
     voxel_size_m: float
@@ -53,6 +54,7 @@ class ReferenceMap:
     hypotheses: dict[Key, dict[int, int]] = field(default_factory=dict)
     instances: dict[int, Instance] = field(default_factory=dict)
     dropped_keys: set[Key] = field(default_factory=set)
+    slot_order: list[Key] = field(default_factory=list)
     seen: Counter[str] = field(default_factory=Counter)
 
     # ---- dense layer
@@ -213,11 +215,34 @@ class ReferenceMap:
         far = [
             key for key in self.dense_weight if math.dist(center_of(key, self.voxel_size_m), center_m) > self.window_radius_m
         ]
-        for key in far:
-            del self.dense_weight[key], self.dense_mean[key], self.dense_roundings[key]
-            self.dropped_keys.add(key)
+        self._drop_dense(far)
         self.seen["window_dropped"] += len(far)
         return len(far)
+
+    def _drop_dense(self, keys: list[Key]) -> None:
+        for key in keys:
+            del self.dense_weight[key], self.dense_mean[key], self.dense_roundings[key]
+            self.dropped_keys.add(key)
+
+    # ---- want of memory
+
+    def set_window_radius(self, radius_m: float) -> None:
+        """The radius of later prunings."""
+        self.window_radius_m = radius_m
+
+    def drop_least_observed(self, count: int) -> int:
+        """Forget the dense layer of the voxels of least weight, of equal ones those of the lowest slot."""
+        slot = {key: number for number, key in enumerate(self.slot_order)}
+        by_weight = sorted(self.dense_weight, key=lambda key: (self.dense_weight[key], slot[key]))
+        gone, kept = by_weight[:count], by_weight[count:]
+        self.seen["least_observed_dropped"] += len(gone)
+        if gone and kept and self.dense_weight[gone[-1]] == self.dense_weight[kept[0]]:
+            self.seen["least_observed_tie"] += 1
+        self._drop_dense(gone)
+        return len(gone)
+
+    def release_unused(self) -> None:
+        """Nothing here is kept for later."""
 
     # ---- removal
 

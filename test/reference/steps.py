@@ -1,4 +1,4 @@
-"""Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, removals, fusions.
+"""Sequences of what can happen to a map, drawn at random: frames, proposals, window moves, removals, fusions, little memory.
 
 A step applies to the reference and to the package's map alike, for both have the same methods. Points lie inside their
 voxel, away from its walls, and dense weights are multiples of 1/64, so that sums are exact and comparisons of evidence have
@@ -78,6 +78,34 @@ class RemoveStep:
 
 
 @dataclass(frozen=True)
+class RadiusStep:
+    """Argument of set_window_radius; only for maps that have a window."""
+
+    radius_m: float
+
+    def apply(self, target: Any) -> Any:
+        return target.set_window_radius(self.radius_m)
+
+
+@dataclass(frozen=True)
+class DropStep:
+    """Argument of drop_least_observed."""
+
+    count: int
+
+    def apply(self, target: Any) -> Any:
+        return target.drop_least_observed(self.count)
+
+
+@dataclass(frozen=True)
+class ReleaseStep:
+    """A call of release_unused, which must not show."""
+
+    def apply(self, target: Any) -> Any:
+        target.release_unused()
+
+
+@dataclass(frozen=True)
 class FuseStep:
     """A fusion."""
 
@@ -87,7 +115,7 @@ class FuseStep:
         return target.fuse(self.full)
 
 
-Step = DenseStep | ProposalStep | WindowStep | RemoveStep | FuseStep
+Step = DenseStep | ProposalStep | WindowStep | RemoveStep | RadiusStep | DropStep | ReleaseStep | FuseStep
 
 
 def points_in(keys: np.ndarray, voxel_size_m: float, rng: np.random.Generator) -> np.ndarray:
@@ -134,6 +162,16 @@ def remove_step(keys: list[Key], setting: Setting, rng: np.random.Generator) -> 
     return RemoveStep(points_in(np.array(keys).reshape(-1, 3), setting.voxel_size_m, rng))
 
 
+def memory_step(setting: Setting, most: int, rng: np.random.Generator) -> Step:
+    """What a map does when memory is short; at most so many voxels are dropped."""
+    kind = rng.random()
+    if kind < 0.5:
+        return DropStep(int(rng.integers(0, most + 1)))
+    if kind < 0.75 and setting.window_radius_m > 0:
+        return RadiusStep(float(setting.window_radius_m * rng.choice([0.7, 1.0, 1.3])))
+    return ReleaseStep()
+
+
 def random_box(extent: int, rng: np.random.Generator) -> list[Key]:
     """Voxels of a random box in [-extent, extent)^3, with holes and repetitions."""
     low = rng.integers(-extent, extent, 3)
@@ -145,8 +183,11 @@ def random_box(extent: int, rng: np.random.Generator) -> list[Key]:
 
 
 def random_steps(setting: Setting, extent: int, count: int, seed: int) -> list[Step]:
-    """A long walk through one place, so that objects are seen again, crowd each other out and leave the window."""
-    rng = np.random.default_rng(seed)
+    """A long walk through one place, so that objects are seen again, crowd each other out and leave the window.
+
+    Beside the steps that are counted, memory is short now and then.
+    """
+    rng, shortage = np.random.default_rng(seed), np.random.default_rng([seed, 1])
     steps: list[Step] = []
     for _ in range(count):
         kind = rng.random()
@@ -163,6 +204,8 @@ def random_steps(setting: Setting, extent: int, count: int, seed: int) -> list[S
             steps.append(remove_step(everything if rng.random() < 0.15 else random_box(extent, rng), setting, rng))
         else:
             steps.append(FuseStep(full=rng.random() < 0.3))
+        if shortage.random() < 0.08:
+            steps.append(memory_step(setting, extent**3, shortage))
     return steps
 
 
@@ -192,7 +235,7 @@ def _boxes(draw: st.DrawFn) -> list[Key]:
 def sequences(draw: st.DrawFn, max_steps: int = 12, **fixed: Any) -> tuple[Setting, list[Step]]:
     """A map's setting, of which some fields may be given, and what happens to it; shrinks in steps, masks and voxels."""
     setting = replace(draw(settings_of_maps), **fixed)
-    kinds = ["dense", "proposals", "proposals", "window", "remove", "fuse"]
+    kinds = ["dense", "proposals", "proposals", "window", "remove", "memory", "fuse"]
     steps: list[Step] = []
     for kind in draw(st.lists(st.sampled_from(kinds), max_size=max_steps)):
         rng = np.random.default_rng(draw(_seeds))
@@ -205,6 +248,8 @@ def sequences(draw: st.DrawFn, max_steps: int = 12, **fixed: Any) -> tuple[Setti
             steps.append(WindowStep(rng.uniform(-2.5, 2.5, 3) * setting.voxel_size_m))
         elif kind == "remove":
             steps.append(remove_step(draw(st.one_of(_boxes(), st.lists(_cells, max_size=4))), setting, rng))
+        elif kind == "memory":
+            steps.append(memory_step(setting, 12, rng))
         else:
             steps.append(FuseStep(draw(st.booleans())))
     return setting, steps

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fus3dmaps_core.storage import read_manifest
 from fus3dmaps_core.encoders import registry
 from fus3dmaps_core.messages import decode_color
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+from fus3dmaps_core.storage import read_manifest
 from fus3dmaps_ros import cli
 
 Run = Callable[..., tuple[int, str, str]]

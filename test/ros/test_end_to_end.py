@@ -15,7 +15,7 @@ import pytest
 import rclpy
 from rclpy.context import Context
 from rclpy.node import Node
-from robot import TIMEOUT_S, CallbackThreads, wait_until
+from robot import RELIABLE_INPUTS, TIMEOUT_S, CallbackThreads, wait_until
 from sensor_msgs.msg import PointCloud2
 from stand_ins import wall_frame
 
@@ -26,6 +26,7 @@ from fus3dmaps_ros.outputs import LATCHED
 
 ROOT = Path(__file__).resolve().parents[2]
 STAND_IN = [sys.executable, str(ROOT / "test" / "ros" / "stand_in_node.py")]
+RELIABLE_ARGUMENTS = ["--ros-args", *(word for key in RELIABLE_INPUTS for word in ("-p", f"{key}:=reliable"))]
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 100_000_000
 FRAMES = 60
@@ -96,7 +97,7 @@ def end(process: subprocess.Popen[str], number: signal.Signals) -> str:
 
 
 def test_queries_are_answered_while_a_recording_is_mapped(start, user, bag) -> None:
-    node = start([*STAND_IN, "--ros-args", "-p", "use_sim_time:=true", "-p", "node.input_qos:=reliable"], SLOW_S="0.1")
+    node = start([*STAND_IN, *RELIABLE_ARGUMENTS, "-p", "use_sim_time:=true"], SLOW_S="0.1")
     client = user.create_client(QueryText, "/fus3dmaps/query_text")
     similarity: list[PointCloud2] = []
     maps: list[PointCloud2] = []
@@ -140,7 +141,7 @@ def test_queries_are_answered_while_a_recording_is_mapped(start, user, bag) -> N
 
 
 def test_a_signal_in_the_middle_of_an_inference_ends_the_node_well(start, user, bag) -> None:
-    node = start([*STAND_IN, "--ros-args", "-p", "node.input_qos:=reliable"], SLOW_S="3600")
+    node = start([*STAND_IN, *RELIABLE_ARGUMENTS], SLOW_S="3600")
     client = user.create_client(QueryText, "/fus3dmaps/query_text")
     assert client.wait_for_service(TIMEOUT_S)
     player = start([sys.executable, "-m", "fus3dmaps_ros.player_node", str(bag), "--rate", "10"])

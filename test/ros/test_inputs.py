@@ -3,15 +3,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
-from nav_msgs.msg import Odometry
-from robot import camera_info_message, depth_message, header, pose_message, rgb_message, wait_until
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from robot import (
+    CallbackThreads,
+    camera_info_message,
+    depth_message,
+    header,
+    pose_message,
+    rgb_message,
+    wait_until,
+)
+from sensor_msgs.msg import CameraInfo, Image
 from stand_ins import wall_frame
 
+from fus3dmaps_core.config import Config
 from fus3dmaps_ros.drops import DropLog
+from fus3dmaps_ros.inputs import Inputs, input_qos
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
@@ -103,24 +120,88 @@ def test_an_image_without_depth_or_pose_is_given_up_and_counted(robot) -> None:
     assert counts["no_depth"] + counts["no_pose"] + counts["pose_gap"] == 1
 
 
-def test_poses_may_come_as_odometry(make_robot) -> None:
-    robot = make_robot(**{"input.pose_source": "odometry"})
-    publisher = robot.user.create_publisher(Odometry, "odom", 10)
-    wait_until(publisher.get_subscription_count, "odometry matched")
-    frame = wall_frame(START_NS)
-    message = Odometry(header=header(START_NS, "map"))
-    message.pose.pose = pose_message(frame).pose
-    publisher.publish(message)
-    robot.map(frame)
-
-
 def test_topics_without_a_message_are_named(robot) -> None:
     silent = robot.mapper._inputs.silent()
     assert [phrase.split()[0].removeprefix(robot.namespace) for phrase in silent] == [
-        "/rgb/camera_info",
         "/rgb/image",
         "/depth/image",
+        "/rgb/camera_info",
         "/pose",
     ]
     robot.map(wall_frame(START_NS))
     assert robot.mapper._inputs.silent() == []
+
+
+def test_a_closed_robot_hears_nothing(robot) -> None:
+    robot.map(wall_frame(START_NS))
+    robot.mapper._inputs.close()
+    robot.mapper._inputs.close()
+    wait_until(
+        lambda: not any(publisher.get_subscription_count() for publisher in robot.publishers.values()), "unsubscribed"
+    )
+    assert robot.mapper._inputs.silent() == []
+
+
+def test_changes_of_the_camera_are_counted_and_followed(robot) -> None:
+    robot.map(wall_frame(START_NS))
+    frame = wall_frame(START_NS + SECOND_NS, x_m=0.5)
+    closer = replace(frame, intrinsics=replace(frame.intrinsics, fx=600.0))
+    robot.makers["rgb"] = lambda frame: changed(rgb_message(frame), header=header(frame.stamp_ns, "another_camera"))
+    robot.map(closer)
+    robot.map(replace(closer, stamp_ns=START_NS + 2 * SECOND_NS, T_world_camera=np.eye(4)))
+    assert robot.mapper.drops.counts() == {"intrinsics_changed": 1, "frame_id_changed": 1}
+
+
+@pytest.mark.parametrize(
+    ("profile", "reliability", "durability"),
+    [
+        ("sensor_data", ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
+        ("reliable", ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
+        ("transient_local", ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+        ("best_available", ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),  # Nobody offers less.
+    ],
+)
+def test_each_input_has_the_qos_of_its_profile(profile, reliability, durability) -> None:
+    with node_alone() as node:
+        config = Config().with_values({"input.depth_qos": profile})
+        inputs = Inputs(node, config, lambda paired: None, DropLog(print))
+        found = {}
+        for topic in ("rgb/image", "depth/image", "rgb/camera_info", "pose"):
+            (endpoint,) = node.get_subscriptions_info_by_topic(f"/{topic}")
+            found[topic] = (endpoint.qos_profile.reliability, endpoint.qos_profile.durability)
+        default = (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE)
+        assert found == {**dict.fromkeys(found, default), "depth/image": (reliability, durability)}
+        inputs.close()
+
+
+def test_best_available_takes_what_the_publisher_offers() -> None:
+    with node_alone() as node:
+        node.create_publisher(Image, "depth/image", input_qos("sensor_data", 1))
+        config = Config().with_values({"input.depth_qos": "best_available"})
+        inputs = Inputs(node, config, lambda paired: None, DropLog(print))
+        (endpoint,) = node.get_subscriptions_info_by_topic("/depth/image")
+        assert endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        assert endpoint.qos_profile.durability == DurabilityPolicy.VOLATILE
+        inputs.close()
+
+
+def test_a_latched_camera_model_is_heard_by_who_comes_late() -> None:
+    with node_alone() as node:
+        latched = node.create_publisher(CameraInfo, "rgb/camera_info", input_qos("transient_local", 1))
+        latched.publish(camera_info_message(wall_frame(START_NS)))
+        config = Config().with_values({"input.camera_info_qos": "transient_local"})
+        inputs = Inputs(node, config, lambda paired: None, DropLog(print))
+        with CallbackThreads(node.context, node):
+            wait_until(lambda: "/rgb/camera_info" not in " ".join(inputs.silent()), "camera model heard")
+
+
+@contextmanager
+def node_alone() -> Iterator[Node]:
+    context = Context()
+    rclpy.init(args=[], context=context)
+    node = Node("alone", context=context)
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.shutdown(context=context)

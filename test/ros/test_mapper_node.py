@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from rclpy.parameter import Parameter
-from robot import stand_in_pipeline
+from robot import stand_in_pipeline, wait_until
+from sensor_msgs.msg import PointCloud2
 from stand_ins import wall_frame
 
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.mapper_node import main
 
@@ -19,8 +24,9 @@ START_NS = 1_700_000_000 * 10**9
     [
         (["--ros-args", "-p", "map.voxel_size_m:=-1.0"], "map.voxel_size_m"),
         (["--ros-args", "-p", "map.voxel_size_m:=1"], "map.voxel_size_m"),
-        (["--ros-args", "-p", "node.input_qos:=fast"], "node.input_qos"),
+        (["--ros-args", "-p", "input.rgb_qos:=fast"], "input.rgb_qos"),
         (["--ros-args", "-r", "__ns:=/not a name"], "not a name"),
+        (["--ros-args", "-p", "input.rgb_topic:=not a topic"], "not a topic"),
         (["--ros-args", "--params-file", "/nowhere/at/all.yaml"], "/nowhere/at/all.yaml"),
         (["--ros-args", "--frobnicate"], "--frobnicate"),
         (["--frobnicate"], "--frobnicate"),
@@ -69,13 +75,63 @@ def test_top_k_changes_at_run_time(robot) -> None:
     assert len(robot.call(QueryText, "query_text", prompts=["red"]).instances) == 1
 
 
+def test_a_memory_budget_changes_at_run_time(make_robot) -> None:
+    # Few samples: a keyframe's worth of dense voxels, which a budget never goes below, is little.
+    robot = make_robot(**{"sampling.dense_per_patch": 1, "sampling.instance_per_patch": 1})
+    for index in range(5):
+        robot.map(wall_frame(START_NS + index * 10**9, x_m=1.5 * index))
+    semantic_map = robot.mapper.pipeline.semantic_map
+    dense = semantic_map.dense_voxel_count
+    assert robot.mapper.set_parameters([Parameter("map.memory_budget_mib", value=0.01)])[0].successful
+    robot.map(wall_frame(START_NS + 5 * 10**9, x_m=7.5))
+    assert semantic_map.dense_voxel_count < dense
+    assert robot.mapper.status_message().memory_budget_bytes == round(0.01 * 2**20)
+
+
+def test_periods_change_at_run_time(make_robot) -> None:
+    robot = make_robot(**{"node.status_period_s": 3600.0, "node.publish_period_s": 3600.0})
+    robot.map(wall_frame(START_NS))
+    statuses, clouds = robot.listen(MapperStatus, "status"), robot.listen(PointCloud2, "map")
+    for name in ("node.status_period_s", "node.publish_period_s"):
+        assert robot.mapper.set_parameters([Parameter(name, value=0.05)])[0].successful
+    wait_until(lambda: len(statuses) > 1 and clouds, "status and map published")
+
+
+def test_a_parameter_that_is_set_while_the_models_load_takes_effect(make_robot) -> None:
+    robots: list[Any] = []
+
+    def interrupted(config: Any) -> Pipeline:
+        mapper = robots[0].mapper
+        assert mapper.set_parameters([Parameter("keyframes.dense_translation_m", value=3.0)])[0].successful
+        assert not mapper.set_parameters([Parameter("map.voxel_size_m", value=0.2)])[0].successful
+        return stand_in_pipeline(config)
+
+    robots.append(make_robot(interrupted, **{"node.autostart": False}))
+    robots[0].mapper.bring_up()
+    robots[0].mapper.worker.between_frames(lambda: None).result(60)
+    assert robots[0].mapper.pipeline.config.keyframes.dense_translation_m == 3.0
+    assert robots[0].mapper.pipeline.config.map.voxel_size_m == 0.05
+
+
 def test_topics_and_services_have_their_names(mapped_robot) -> None:
     own = f"{mapped_robot.namespace}/fus3dmaps"
     topics = {
         name for name, _ in mapped_robot.user.get_publisher_names_and_types_by_node("fus3dmaps", mapped_robot.namespace)
     }
-    assert {f"{own}/{name}" for name in ("map", "instances", "similarity", "path")} <= topics
+    assert {f"{own}/{name}" for name in ("map", "instances", "similarity", "path", "answer", "labels", "status")} <= topics
     services = {
         name for name, _ in mapped_robot.user.get_service_names_and_types_by_node("fus3dmaps", mapped_robot.namespace)
     }
-    assert {f"{own}/{name}" for name in ("query_text", "fuse", "reset")} <= services
+    assert {
+        f"{own}/{name}"
+        for name in (
+            "query_text",
+            "query_image",
+            "label_map",
+            "list_instances",
+            "fuse",
+            "reset",
+            "save_map",
+            "load_map",
+        )
+    } <= services

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from nav_msgs.msg import Path
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
-from robot import wait_until
+from robot import RELIABLE_INPUTS, wait_until
 from sensor_msgs.msg import PointCloud2
 from stand_ins import wall_frame
 from std_srvs.srv import Trigger
@@ -16,15 +16,8 @@ from visualization_msgs.msg import MarkerArray
 
 from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.conversions import from_cloud
-from fus3dmaps_ros.outputs import LATCHED
 
 STAMP_NS = 1_700_000_000_123_456_789
-
-
-def listen(robot: Any, message_type: Any, name: str) -> list[Any]:
-    received: list[Any] = []
-    robot.user.create_subscription(message_type, f"fus3dmaps/{name}", received.append, LATCHED)
-    return received
 
 
 def stamp_of(message: Any) -> int:
@@ -43,7 +36,7 @@ def test_outputs_are_reliable_and_latched(mapped_robot, name) -> None:
     [("sensor_data", ReliabilityPolicy.BEST_EFFORT), ("reliable", ReliabilityPolicy.RELIABLE)],
 )
 def test_inputs_have_the_qos_of_their_profile(make_robot, profile, reliability) -> None:
-    robot = make_robot(**{"node.input_qos": profile})
+    robot = make_robot(**dict.fromkeys(RELIABLE_INPUTS, profile))
     for topic in ("rgb/image", "depth/image", "rgb/camera_info", "pose"):
         (endpoint,) = robot.user.get_subscriptions_info_by_topic(f"{robot.namespace}/{topic}")
         assert endpoint.qos_profile.reliability == reliability
@@ -51,7 +44,7 @@ def test_inputs_have_the_qos_of_their_profile(make_robot, profile, reliability) 
 
 
 def test_the_map_is_published_to_who_listens(mapped_robot) -> None:
-    clouds = listen(mapped_robot, PointCloud2, "map")
+    clouds = mapped_robot.listen(PointCloud2, "map")
     wait_until(lambda: clouds, "map received")
     assert (clouds[0].header.frame_id, stamp_of(clouds[0])) == ("map", STAMP_NS)
     table = from_cloud(clouds[0])
@@ -62,7 +55,7 @@ def test_the_map_is_published_to_who_listens(mapped_robot) -> None:
 
 
 def test_instances_and_path_are_published_to_who_listens(mapped_robot) -> None:
-    arrays, paths = listen(mapped_robot, MarkerArray, "instances"), listen(mapped_robot, Path, "path")
+    arrays, paths = mapped_robot.listen(MarkerArray, "instances"), mapped_robot.listen(Path, "path")
     wait_until(lambda: arrays and paths, "instances and path received")
     instances = mapped_robot.mapper.pipeline.semantic_map.instances()
     drawn = {marker.id for marker in arrays[0].markers if marker.ns == "boxes"}
@@ -72,7 +65,7 @@ def test_instances_and_path_are_published_to_who_listens(mapped_robot) -> None:
 
 def test_an_unchanged_map_is_sent_once_and_a_changed_one_again(robot) -> None:
     robot.map(wall_frame(STAMP_NS))
-    clouds = listen(robot, PointCloud2, "map")
+    clouds = robot.listen(PointCloud2, "map")
     wait_until(lambda: clouds, "map received")
     robot.map(wall_frame(STAMP_NS + 10**9, x_m=0.5))
     wait_until(lambda: stamp_of(clouds[-1]) == STAMP_NS + 10**9, "changed map received")
@@ -84,7 +77,7 @@ def test_a_published_answer_is_latched_and_cleared_by_a_reset(robot) -> None:
     robot.map(wall_frame(STAMP_NS))
     silent = robot.call(QueryText, "query_text", prompts=["blue"])
     loud = robot.call(QueryText, "query_text", prompts=["red"], publish=True)
-    late = listen(robot, PointCloud2, "similarity")
+    late = robot.listen(PointCloud2, "similarity")
     wait_until(lambda: late, "latched answer received")
     assert late == [loud.similarity]
     assert silent.similarity != loud.similarity

@@ -13,7 +13,7 @@ from rclpy.parameter import Parameter
 
 from fus3dmaps_core.config import Config, fields
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_ros.parameters import RUNTIME, declare_parameters, follow_changes, unknown_overrides
+from fus3dmaps_ros.parameters import FIXED, RUNTIME, declare_parameters, follow_changes, unknown_overrides
 
 
 @contextlib.contextmanager
@@ -37,8 +37,9 @@ def test_every_key_is_declared_with_default_and_description() -> None:
             assert (list(value) if isinstance(field.default, list) else value) == field.default
             descriptor = node.describe_parameter(key)
             assert descriptor.description == field.description
-            assert descriptor.read_only == (key not in RUNTIME)
-        assert set(fields()) >= RUNTIME
+            assert descriptor.read_only == (key in FIXED)
+            assert ("while the node is unconfigured" in descriptor.additional_constraints) == (key not in RUNTIME | FIXED)
+        assert set(fields()) >= RUNTIME | FIXED
 
 
 def test_bounds_are_ranges() -> None:
@@ -79,7 +80,7 @@ def test_overrides_reach_the_configuration() -> None:
         ("map.dtype", "float8"),
         ("input.map_frame", ""),
         ("input.T_body_camera", [1.0]),
-        ("node.input_qos", "fast"),
+        ("input.rgb_qos", "fast"),
     ],
 )
 def test_a_wrong_value_is_refused_by_name(key, value) -> None:
@@ -102,9 +103,35 @@ def test_run_time_changes_are_checked_and_applied() -> None:
         follow_changes(node, lambda: state[-1], state.append)
         assert node.set_parameters([Parameter("query.top_k", value=3)])[0].successful
         assert state[-1].query.top_k == 3
-        for key, value in (("query.top_k", 0), ("map.voxel_size_m", 0.2)):
+        for key, value in (("query.top_k", 0), ("map.voxel_size_m", 0.2), ("node.autostart", False)):
             result = node.set_parameters([Parameter(key, value=value)])[0]
             assert not result.successful
             assert key in result.reason
         assert not node.set_parameters([Parameter("query.top_k", value="many")])[0].successful
         assert state[-1] == Config().with_values({"query.top_k": 3})
+
+
+def test_what_shapes_the_map_can_change_until_there_is_one() -> None:
+    with node_with() as node:
+        state, configured = [declare_parameters(node)], [False]
+        follow_changes(node, lambda: state[-1], state.append, lambda: configured[0])
+        pose = [0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]
+        for key, value in (("map.voxel_size_m", 0.2), ("encoder.name", "huge"), ("input.T_body_camera", pose)):
+            assert node.set_parameters([Parameter(key, value=value)])[0].successful
+            assert state[-1].flat()[key] == value
+        configured[0] = True
+        result = node.set_parameters([Parameter("map.voxel_size_m", value=0.3)])[0]
+        assert not result.successful
+        assert "while the node is unconfigured" in result.reason
+        # Setting what is set already, as tools do that restore a whole file, is no change.
+        assert node.set_parameters([Parameter("map.voxel_size_m", value=0.2)])[0].successful
+        assert state[-1].map.voxel_size_m == 0.2
+
+
+def test_a_refused_parameter_of_several_set_at_once_leaves_all_as_they_were() -> None:
+    with node_with() as node:
+        state = [declare_parameters(node)]
+        follow_changes(node, lambda: state[-1], state.append)
+        both = [Parameter("query.top_k", value=3), Parameter("map.voxel_size_m", value=0.2)]
+        assert not node.set_parameters_atomically(both).successful
+        assert state[-1] == Config()

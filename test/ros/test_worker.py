@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -132,6 +132,73 @@ def test_calls_run_between_frames_and_before_those_that_wait(bench) -> None:
     done.result(60)
     wait_until(lambda: bench.worker.stamp_ns == 2, "frame 2 mapped")
     assert bench.pipeline.events == [1, "call", 2]
+
+
+class Observer:
+    def __init__(self) -> None:
+        self.events: list[Any] = []
+
+    def offered(self, waiting: int) -> None:
+        self.events.append(("offered", waiting))
+
+    def decoded(self, paired: Frame, frame: Frame) -> None:
+        self.events.append(("decoded", paired.stamp_ns, frame.stamp_ns))
+
+    def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
+        self.events.append(("finished", sorted(durations_s), waiting))
+
+
+def test_an_observer_is_told_of_every_frame(bench) -> None:
+    bench.worker.observer = observer = Observer()
+    for frame in (Frame(1), Frame(2, RuntimeError("odd")), Frame(3, FrameError("rgb/image: empty"))):
+        count = len(observer.events)
+        bench.worker.offer(frame)
+        wait_until(lambda count=count: observer.events[count:][-1:] and observer.events[-1][0] == "finished", "finished")
+    bench.pipeline.wanted = False
+    bench.worker.offer(Frame(4))
+    wait_until(lambda: bench.worker.counts().not_keyframes == 1, "no keyframe")
+    wait_until(lambda: len(observer.events) == 10, "all told")
+    failed = ("finished", [], 0)
+    assert observer.events == [
+        ("offered", 1),
+        ("decoded", 1, 1),
+        ("finished", ["decode"], 0),
+        ("offered", 1),
+        ("decoded", 2, 2),
+        failed,
+        ("offered", 1),
+        failed,
+        ("offered", 1),
+        failed,
+    ]
+
+
+def test_the_latest_keyframes_tell_how_long_each_stage_takes(bench) -> None:
+    assert bench.worker.stage_times() == {}
+    for stamp_ns in (1, 2):
+        bench.worker.offer(Frame(stamp_ns))
+    wait_until(lambda: bench.worker.stamp_ns == 2, "mapped")
+    (stage,) = bench.worker.stage_times().items()
+    assert stage[0] == "decode"
+    assert 0 <= stage[1].mean_s <= stage[1].max_s
+
+
+def test_a_call_gives_its_result_and_one_that_only_looks_is_no_change(bench) -> None:
+    before = bench.worker.revision
+    assert bench.worker.between_frames(lambda: 7, changes=False).result(60) == 7
+    assert bench.worker.revision == before
+    assert bench.worker.between_frames(lambda: 8).result(60) == 8
+    assert bench.worker.revision == before + 1
+
+
+def test_waiting_frames_can_be_dropped(bench) -> None:
+    bench.hold_in(1)
+    bench.worker.offer(Frame(2))
+    bench.worker.drop_waiting()
+    assert bench.worker.waiting == 0
+    bench.pipeline.gate.set()
+    bench.worker.between_frames(lambda: None).result(60)
+    assert bench.pipeline.events == [1]
 
 
 def test_a_failing_call_reports_to_its_caller_only(bench) -> None:

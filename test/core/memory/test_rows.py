@@ -159,3 +159,31 @@ def test_more_rows_than_can_be_numbered_are_refused_before_anything_is_touched(m
     assert (len(pool), pool.high_water) == (4, 4)
     pool.free(rows[1:2])
     assert sorted(pool.allocate(2).tolist()) == [1, 4]
+
+
+@on_every_device
+@in_every_dtype
+def test_rows_moved_together_let_the_blocks_behind_them_go(dtype: torch.dtype, device: torch.device):
+    rng = np.random.default_rng(1)
+    pool = RowPool(2, dtype, device)
+    count = 3 * pool.block_rows
+    rows = pool.allocate(count)
+    values = values_of(rng, count)
+    pool.write(rows, values.to(device), seeds_for(rows))
+    full_nbytes = pool.nbytes
+    sources, targets = rows[-5:], rows[[3, 0, 7, 1, 5]]
+    pool.move(sources, targets)
+    pool.free(rows[8:])
+    assert (pool.spare_blocks, pool.nbytes >= full_nbytes) == (2, True)
+    pool.truncate(8)
+    assert (len(pool), pool.high_water, len(pool.blocks), pool.spare_blocks) == (8, 8, 1, 0)
+    assert pool.nbytes < 0.4 * full_nbytes
+    expected = values[:8].clone()
+    expected[[3, 0, 7, 1, 5]] = values[-5:]
+    assert pool.read(rows[:8]).cpu().tolist() == expected.tolist()
+    again = pool.allocate(2 * pool.block_rows)
+    assert again.tolist() == list(range(8, 8 + 2 * pool.block_rows))
+    pool.write(again, values[: len(again)].to(device), seeds_for(again))
+    assert pool.read(again).cpu().tolist() == values[: len(again)].tolist()
+    pool.truncate(0)
+    assert (len(pool), pool.high_water, pool.blocks) == (0, 0, [])

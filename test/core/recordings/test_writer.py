@@ -135,6 +135,16 @@ def test_topics_frame_and_mounting_follow_the_configuration(tmp_path, frames):
         RecordingWriter(tmp_path / "other.mcap", InputConfig(T_body_camera=[0.0] * 7))
 
 
+@pytest.mark.parametrize(
+    "values",
+    [{"rgb_transport": "compressed"}, {"depth_registered": False}, {"pose_source": "tf"}, {"cameras": "front"}],
+)
+def test_what_is_not_written_cannot_be_asked_for(tmp_path, values):
+    with pytest.raises(ConfigError, match=f"input\\.{next(iter(values))}"):
+        RecordingWriter(tmp_path / "bag.mcap", InputConfig(**values))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_existing_files_and_odd_names_are_refused(tmp_path, frames):
     path = write(tmp_path / "bag.mcap", frames[:1])
     before = path.read_bytes()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import ros_messages as ros
+from compressed_messages import compressed_depth_rvl, png
 from mcap.writer import Writer
 from recorded_frames import PERIOD_NS, START_NS, assert_same_frames, noise_frames
 from rosbags.rosbag2 import StoragePlugin
@@ -186,3 +187,61 @@ def test_images_at_the_end_are_settled(tmp_path):
     with BagSource(write_messages(tmp_path / "bag.mcap", messages), InputConfig()) as source:
         assert [paired.stamp_ns for paired in source] == [START_NS, START_NS + PERIOD_NS]
         assert source.pairer.drops == {"no_depth": 1}
+
+
+def test_compressed_recordings(tmp_path, frames):
+    messages = []
+    for frame in frames[:2]:
+        stamp_ns = frame.stamp_ns
+        depth_mm = np.rint(frame.depth_m * 1000).astype(np.uint16)
+        info = ros.camera_info(stamp_ns, 160, 120)
+        messages += [
+            ("/rgb/camera_info", stamp_ns, info),
+            ("/pose", stamp_ns, ros.pose(stamp_ns)),
+            ("/depth/image/compressedDepth", stamp_ns, ros.compressed(stamp_ns, *compressed_depth_rvl(depth_mm))),
+            ("/rgb/image/compressed", stamp_ns, ros.compressed(stamp_ns, *png(frame.rgb))),
+        ]
+    path = write_messages(tmp_path / "bag.mcap", messages)
+    with BagSource(path, InputConfig(rgb_transport="compressed", depth_transport="compressedDepth")) as source:
+        assert len(source) == 2
+        for paired, frame in zip(source, frames, strict=False):
+            decoded = paired.decode(ImageConfig())
+            np.testing.assert_array_equal(decoded.rgb, frame.rgb)
+            np.testing.assert_array_equal(np.rint(decoded.depth_m * 1000), np.rint(frame.depth_m * 1000))
+    with pytest.raises(RecordingError, match=r"'/rgb/image' \(parameter 'input\.rgb_topic'\).*/rgb/image/compressed"):
+        BagSource(path, InputConfig())
+
+
+def test_poses_from_the_transforms_of_a_recording(tmp_path):
+    messages = [message for stamp_ns in (S, 2 * S) for message in complete(stamp_ns) if message[0] != "/pose"]
+    messages.append(("/tf_static", 0, ros.transforms(("base", "camera", 0, (0.0, 3.0, 0.0)))))
+    messages += [("/tf", t, ros.transforms(("map", "base", t, (t / S, 0.0, 0.0)))) for t in range(0, 3 * S, S // 4)]
+    messages.append(("/tf", S, ros.transforms(("map", "ghost", S, (np.nan, 0.0, 0.0)))))
+    path = write_messages(tmp_path / "bag.mcap", messages)
+    with BagSource(path, InputConfig(pose_source="tf")) as source:
+        for _ in range(2):  # Each iteration starts anew.
+            assert [paired.T_world_camera[:2, 3].tolist() for paired in source] == [[1.0, 3.0], [2.0, 3.0]]
+            assert source.pairer.drops == {"bad_transform": 1}
+            assert source.messages_read == source.messages_total == len(messages)
+
+
+def test_a_recording_without_transforms_is_refused(recording):
+    with pytest.raises(
+        RecordingError, match=r"'/tf' or '/tf_static' \(parameter 'input\.pose_source'\); it has /depth/image"
+    ):
+        BagSource(recording, InputConfig(pose_source="tf"))
+
+
+def test_recordings_of_several_cameras(tmp_path):
+    messages = []
+    for stamp_ns in (S, 2 * S):
+        for message in complete(stamp_ns):
+            names = [message[0]] if message[0] == "/pose" else [f"/front{message[0]}", f"/rear{message[0]}"]
+            messages += [(name, *message[1:]) for name in names]
+    path = write_messages(tmp_path / "bag.mcap", messages)
+    mountings = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    with BagSource(path, InputConfig(cameras="front,rear", T_body_camera=mountings)) as source:
+        assert len(source) == 4
+        frames = [(paired.stamp_ns, paired.T_world_camera[1, 3]) for paired in source]
+    assert sorted(frames) == [(S, 1.0), (S, 2.0), (2 * S, 1.0), (2 * S, 2.0)]
+    assert [stamp_ns for stamp_ns, _ in frames] == [S, S, 2 * S, 2 * S]

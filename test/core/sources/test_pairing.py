@@ -279,7 +279,7 @@ def test_memory_is_bounded_when_only_one_input_is_alive(alive):
         else:
             target.add_pose(ros.pose(stamp_ns))
         target.poll()
-    assert len(target._rgb) + len(target._depth) + len(target._poses) < 20
+    assert target.waiting < 20
 
 
 def reference(rgb, depth, poses, tolerance_ns, gap_ns) -> dict[int, tuple[int, float]]:

@@ -1,0 +1,87 @@
+"""Encoders that run out of GPU memory: a batch is halved and goes on, and what cannot be helped is refused by name."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from fus3dmaps_core.errors import EncoderError
+
+_log = logging.getLogger(__name__)
+
+
+class Batches:
+    """Runs an encoder over many images, in batches that fit its device's memory.
+
+    Attributes:
+        largest: Images that are encoded together at most; None before memory was too small for what was asked.
+    """
+
+    def __init__(self, name: str) -> None:
+        """Start without a limit; ``name`` says in messages which encoder it is."""
+        self._name = name
+        self.largest: int | None = None
+
+    def run(self, encode: Callable[[slice], NDArray[np.float32]], count: int) -> NDArray[np.float32]:
+        """Encode images 0 .. count - 1, in one call where memory allows it.
+
+        Where the device is out of memory, the batch is halved, and stays so for later calls.
+
+        Args:
+            encode: Encodes the images of a slice: (n, d) float32.
+            count: How many images there are.
+
+        Returns:
+            (count, d) float32, what ``encode`` returned, in order.
+
+        Raises:
+            EncoderError: There is not even memory for one image.
+        """
+        parts: list[NDArray[np.float32]] = []
+        start = 0
+        while start < count or not parts:
+            size = count - start if self.largest is None else min(self.largest, count - start)
+            images = slice(start, start + size)
+            if size <= 1:
+                with naming_out_of_memory(self._name):
+                    parts.append(encode(images))
+                start += 1
+                continue
+            try:
+                parts.append(encode(images))
+            except torch.cuda.OutOfMemoryError:
+                self.largest = size // 2
+            else:
+                start += size
+                continue
+            # After the except clause: its exception holds the frames, and those what they had allocated.
+            free_cached_memory()
+            _log.warning("%s: out of memory with %d images at once, going on with %d", self._name, size, self.largest)
+        return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+@contextmanager
+def naming_out_of_memory(name: str) -> Iterator[None]:
+    """Turn a device's want of memory inside into an EncoderError that names the encoder or segmenter.
+
+    Raises:
+        EncoderError: The device was out of memory; what is cached of it was given back.
+    """
+    cause: str | None = None
+    try:
+        yield
+    except torch.cuda.OutOfMemoryError as error:
+        cause = str(error)
+    if cause is not None:
+        free_cached_memory()
+        raise EncoderError(f"{name}: out of memory with a single image: {cause}")
+
+
+def free_cached_memory() -> None:
+    """Give GPU memory that torch keeps for later back to the device, where a GPU is in use."""
+    torch.cuda.empty_cache()

@@ -1,0 +1,97 @@
+"""Which topics the inputs come on, of which message type, and where their messages go, live and recorded alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from fus3dmaps_core.config import InputConfig, QosProfile
+
+_POSE_TYPES = {
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "odometry": "nav_msgs/msg/Odometry",
+}
+
+
+@dataclass(frozen=True)
+class InputStream:
+    """One topic that is listened to.
+
+    Attributes:
+        topic: Its name as configured, with camera and transport.
+        msgtype: Message type, e.g. ``sensor_msgs/msg/Image``.
+        parameter: Key of the parameter that names the topic.
+        qos: Profile by which it is subscribed to.
+        add: Takes a message.
+    """
+
+    topic: str
+    msgtype: str
+    parameter: str
+    qos: QosProfile
+    add: Callable[[Any], None]
+
+
+@dataclass(frozen=True)
+class CameraTopics:
+    """Topics of one camera.
+
+    Attributes:
+        rgb: Colour images, with the transport's suffix.
+        depth: Depth images, with the transport's suffix.
+        camera_info: Camera model of the colour images.
+        depth_camera_info: Camera model of the depth images, None where they are registered to colour.
+    """
+
+    rgb: str
+    depth: str
+    camera_info: str
+    depth_camera_info: str | None
+
+
+def camera_topics(config: InputConfig) -> list[CameraTopics]:
+    """The topics of each camera, in the order in which ``input.cameras`` names them."""
+    topics = []
+    for name in config.camera_names:
+        namespace = f"{name}/" if name else ""
+        topics.append(
+            CameraTopics(
+                namespace + _with_transport(config.rgb_topic, config.rgb_transport),
+                namespace + _with_transport(config.depth_topic, config.depth_transport),
+                namespace + config.camera_info_topic,
+                None if config.depth_registered else namespace + config.depth_camera_info_topic,
+            )
+        )
+    return topics
+
+
+def image_type(transport: str) -> str:
+    """Message type of images of a transport."""
+    return "sensor_msgs/msg/Image" if transport == "raw" else "sensor_msgs/msg/CompressedImage"
+
+
+def pose_parameter(config: InputConfig) -> str:
+    """Name of the field of the configuration that holds the topic of the poses; of no use with TF."""
+    return f"{config.pose_source}_topic"
+
+
+def pose_topic(config: InputConfig) -> str:
+    """Topic of the poses; ``TF`` where they come from there."""
+    return "TF" if config.pose_source == "tf" else str(getattr(config, pose_parameter(config)))
+
+
+def pose_type(config: InputConfig) -> str | None:
+    """Message type of the poses, None where they come from TF."""
+    return _POSE_TYPES.get(config.pose_source)
+
+
+def uses_tf(config: InputConfig) -> bool:
+    """Whether poses or extrinsics are looked up in TF."""
+    return "tf" in (config.pose_source, config.extrinsic_source)
+
+
+def _with_transport(topic: str, transport: str) -> str:
+    """The name under which image_transport publishes."""
+    return topic if transport == "raw" or topic.endswith(f"/{transport}") else f"{topic}/{transport}"

@@ -1,0 +1,46 @@
+"""Answers as ``vision_msgs`` boxes, where that package is installed: what navigation and manipulation stacks read."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Sequence
+from types import ModuleType
+
+from geometry_msgs.msg import Point, Vector3
+from std_msgs.msg import Header
+
+from fus3dmaps_msgs.msg import SemanticInstance
+
+
+def vision_messages() -> ModuleType | None:
+    """The module ``vision_msgs.msg``, None where it is not installed."""
+    try:
+        return importlib.import_module("vision_msgs.msg")
+    except ImportError:
+        return None
+
+
+def to_detections(messages: ModuleType, header: Header, found: Sequence[SemanticInstance]) -> object:
+    """Instances of an answer as a ``Detection3DArray``.
+
+    Args:
+        messages: What :func:`vision_messages` has found.
+        header: Map frame, and how new the map was.
+        found: The instances; each becomes an axis-aligned box with one hypothesis, the prompt and its score, at the
+            instance's centroid.
+    """
+    detections = messages.Detection3DArray(header=header)
+    for instance in found:
+        low, high = instance.box_min, instance.box_max
+        detection = messages.Detection3D(header=header, id=str(instance.id))
+        detection.bbox.center.position = Point(x=(low.x + high.x) / 2, y=(low.y + high.y) / 2, z=(low.z + high.z) / 2)
+        detection.bbox.center.orientation.w = 1.0
+        detection.bbox.size = Vector3(x=high.x - low.x, y=high.y - low.y, z=high.z - low.z)
+        result = messages.ObjectHypothesisWithPose()
+        result.hypothesis.class_id = instance.prompt
+        result.hypothesis.score = float(instance.score)
+        result.pose.pose.position = instance.centroid
+        result.pose.pose.orientation.w = 1.0
+        detection.results.append(result)
+        detections.detections.append(detection)
+    return detections
