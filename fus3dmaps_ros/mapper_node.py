@@ -222,13 +222,12 @@ class MapperNode(ManagedNode):
         if watch is not None:  # It comes a moment after the inputs that it watches.
             watch.arrived(topic, stamp_ns)
 
-    def _log_line(self) -> tuple[str, object]:
-        """A line for the log, and what has to change before there is another: not the seconds that a problem lasts."""
+    def _log_line(self) -> tuple[str, dict[str, str]]:
+        """How it fares, and the problems by kind, for the log."""
         if self.session is None:
-            return self.state, self.state
-        watch, status = self._watch, self.status()
-        problems = watch.problems() if watch is not None else []
-        return "; ".join([status, *(each.sentence for each in problems)]), (status, [each.kind for each in problems])
+            return self.state, {}
+        watch = self._watch
+        return self.status(), {each.kind: each.sentence for each in (watch.problems() if watch is not None else [])}
 
     def _read_config(self) -> Config:
         return self.config

@@ -109,7 +109,7 @@ class StatusPublisher:
         node: Node,
         read: Callable[[], Config],
         report: Callable[[], MapperStatus],
-        line: Callable[[], tuple[str, object]],
+        line: Callable[[], tuple[str, Mapping[str, str]]],
     ) -> None:
         """Advertise the topic and start the timers.
 
@@ -117,13 +117,13 @@ class StatusPublisher:
             node: Owner of the publisher.
             read: Gives the configuration in force.
             report: Makes the message.
-            line: Makes the line for the log, and what it tells: it is logged when that is not what was logged last.
+            line: Makes the line for the log, and gives the problems by kind: each is added to a line when it appears.
         """
         self._node = node
         self._log = node.get_logger()
         self._report = report
         self._line = line
-        self._told: object = None
+        self._told, self._known = "", frozenset[str]()
         self._publisher = node.create_publisher(MapperStatus, "~/status", _QOS)
         group, clock = MutuallyExclusiveCallbackGroup(), Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(read().node.status_period_s, self._publish, callback_group=group, clock=clock)
@@ -141,10 +141,11 @@ class StatusPublisher:
 
     def _say(self) -> None:
         try:
-            line, tells = self._line()
+            line, problems = self._line()
         except Exception:
             self._log.error(f"reporting the status failed\n{traceback.format_exc()}")
             return
-        if tells != self._told:
-            self._log.info(line)
-        self._told = tells
+        fresh = [sentence for kind, sentence in problems.items() if kind not in self._known]
+        if fresh or line != self._told:
+            self._log.info("; ".join([line, *fresh]))
+        self._told, self._known = line, frozenset(problems)
