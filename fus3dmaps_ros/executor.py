@@ -22,6 +22,15 @@ class CallbackExecutor(MultiThreadedExecutor):
         """As the base class."""
         super().__init__(num_threads, **options)
 
+    def spin(self) -> None:
+        """Execute callbacks until shutdown."""
+        try:
+            super().spin()
+        except AttributeError:
+            # A shutdown from another thread takes guards away that this one may be about to wait for.
+            if not self._is_shutdown:
+                raise
+
     def spin_on(self, report: Callable[[str], object]) -> None:
         """Execute callbacks until shutdown, whatever they raise.
 
