@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -21,15 +22,17 @@ class CallbackExecutor(MultiThreadedExecutor):
     def __init__(self, num_threads: int = EXECUTOR_THREADS, **options: Any) -> None:
         """As the base class."""
         super().__init__(num_threads, **options)
+        self._not_spinning = threading.Event()
+        self._not_spinning.set()
 
     def spin(self) -> None:
-        """Execute callbacks until shutdown."""
+        """Execute callbacks until shutdown; by one thread at a time."""
+        self._not_spinning.clear()
         try:
-            super().spin()
-        except AttributeError:
-            # A shutdown from another thread takes guards away that this one may be about to wait for.
-            if not self._is_shutdown:
-                raise
+            while self._context.ok() and not self._is_shutdown:
+                self.spin_once()
+        finally:
+            self._not_spinning.set()
 
     def spin_on(self, report: Callable[[str], object]) -> None:
         """Execute callbacks until shutdown, whatever they raise.
@@ -44,7 +47,26 @@ class CallbackExecutor(MultiThreadedExecutor):
                 report(f"a callback failed\n{traceback.format_exc()}")
                 time.sleep(_PAUSE_S)  # What fails at once, again and again, must not take the processor.
 
-    def finish(self, timeout_s: float) -> bool:
-        """Start no more callbacks; whether those in work were done within the time."""
-        self.shutdown()
-        return bool(self._work_tracker.wait(timeout_s))
+    def shutdown(self, timeout_sec: float | None = None) -> bool:
+        """Start no more callbacks, let the spinning thread return and wait for the callbacks in work.
+
+        Args:
+            timeout_sec: How long to wait, in seconds; without end if None or negative.
+
+        Returns:
+            Whether all was done within the time.
+        """
+        endless = timeout_sec is None or timeout_sec < 0
+        end_s = time.monotonic() + (0.0 if timeout_sec is None else timeout_sec)
+        self._is_shutdown = True
+        # The base class takes away at once what it wakes the spinning thread with: between the two that thread could begin
+        # to wait for something else, and never return.
+        while not self._not_spinning.wait(0.0):
+            if not endless and time.monotonic() >= end_s:
+                break
+            self.wake()
+            self._not_spinning.wait(_PAUSE_S)
+        super().shutdown(0.0)
+        if self._not_spinning.is_set():
+            self._executor.shutdown(wait=False)
+        return bool(self._work_tracker.wait(None if endless else max(0.0, end_s - time.monotonic())))

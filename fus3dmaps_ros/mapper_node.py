@@ -292,7 +292,7 @@ def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, code:
     """Take everything down within two seconds; a second signal cannot interrupt it."""
     for number in _SIGNALS:
         signal.signal(number, signal.SIG_IGN)
-    answered = executor is None or executor.finish(_STOP_TIMEOUT_S / 2)
+    answered = executor is None or executor.shutdown(_STOP_TIMEOUT_S / 2)
     mapped = node is None or node.stop(_STOP_TIMEOUT_S)
     if node is not None:
         node.destroy_node()

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, wait
+from concurrent.futures import CancelledError, Future, wait
 from typing import TypeVar
 
 from fus3dmaps_core.errors import Fus3dmapsError, MapError
@@ -92,7 +93,8 @@ def between_frames(future: Future[T], deadline: Deadline) -> T:
         MapError: The mapping thread ends.
         Exception: What the work raises.
     """
-    wait([future], deadline.remaining_s())
+    with contextlib.suppress(TimeoutError, CancelledError):
+        future.exception(deadline.remaining_s())
     if not future.done() and future.cancel():
         raise CallTimeoutError(f"the frame in work was not done within {deadline.timeout_s:g} s; the map is as it was")
     if future.cancelled():

@@ -124,7 +124,7 @@ class CallbackThreads:
             thread.start()
 
     def __exit__(self, *_: object) -> None:
-        assert all(executor.finish(TIMEOUT_S) for executor in self._executors)
+        assert all(executor.shutdown(TIMEOUT_S) for executor in self._executors)
         for thread in self._threads:
             thread.join(TIMEOUT_S)
             assert not thread.is_alive()
