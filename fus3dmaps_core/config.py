@@ -32,6 +32,11 @@ class EncoderConfig(_Section):
 
     name: str = Field("lite", description="Encoder trio: patch, crop and text encoder of one space.")
     device: str = Field("cpu", description="Torch device of the encoders, e.g. cpu or cuda:0.")
+    weights: str = Field(
+        "",
+        description="Weights of the encoders: a file, a directory that holds them, or a repository of the Hugging Face hub"
+        " (org/repo or org/repo@revision). Empty: those that the authors published, from the local cache or downloaded.",
+    )
 
 
 class SegmenterConfig(_Section):
@@ -82,6 +87,21 @@ class MapConfig(_Section):
     iou_threshold: float = Field(
         0.2, ge=0.0, lt=1.0, description="Voxel IoU above which a proposal joins an existing instance."
     )
+    association: Literal["iou", "visible_iou"] = Field(
+        "iou",
+        description="What a proposal is compared with: all voxels of an instance (iou), or those of its voxels in which the"
+        " keyframe has a point (visible_iou), so that a view of a small part can join a large object.",
+    )
+    merge_overlap: float = Field(
+        0.0,
+        ge=0.0,
+        le=1.0,
+        description="Two instances that meet in a keyframe become one where they share this much of the smaller one's voxels"
+        " and are as alike as merge_cosine says. 0: never.",
+    )
+    merge_cosine: float = Field(
+        0.8, ge=-1.0, le=1.0, description="Cosine that the embeddings of two instances must have, at least, to become one."
+    )
     dtype: Literal["float32", "float16", "int8"] = Field("float16", description="Storage type of dense embeddings.")
     device: str = Field("cpu", description="Torch device that holds the map, e.g. cpu or cuda:0.")
     backend: Literal["auto", "compiled", "torch"] = Field(
@@ -105,6 +125,11 @@ class FusionConfig(_Section):
         0.0, ge=0.0, description="Radius of the sliding window of the dense layer, metres; 0 keeps the whole dense layer."
     )
     period_frames: int = Field(5, ge=1, description="With a sliding window, fuse after every n-th processed frame.")
+    keep_most_evidence: bool = Field(
+        True,
+        description="With a sliding window, replace an object's fused embedding only by one of more evidence; false replaces"
+        " it at every fusion by that of what is left in the window.",
+    )
 
 
 class QueryConfig(_Section):

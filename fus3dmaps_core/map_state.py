@@ -11,10 +11,11 @@ from torch import Tensor
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.kernels.keys import pack
-from fus3dmaps_core.kernels.protocols import Kernels
+from fus3dmaps_core.kernels.protocols import Kernels, Pairs
 from fus3dmaps_core.layers.dense import DenseLayer
 from fus3dmaps_core.layers.fused_instances import FusedInstances
 from fus3dmaps_core.layers.instances import InstanceLayer
+from fus3dmaps_core.layers.merging import merge_overlapping
 from fus3dmaps_core.memory.columns import Column
 from fus3dmaps_core.memory.rounding import seeds_of
 from fus3dmaps_core.memory_budget import KeyframeBound, MemoryUse
@@ -37,16 +38,20 @@ class MapState:
         fused: Fused embeddings of the instances.
     """
 
-    def __init__(self, dimension: int, config: MapConfig, windowed: bool, kernels: Kernels) -> None:
+    def __init__(
+        self, dimension: int, config: MapConfig, windowed: bool, kernels: Kernels, keep_most_evidence: bool = True
+    ) -> None:
         """Start empty."""
         device = torch.device(config.device)
         self._device = device
         self._windowed = windowed
+        self._kernels = kernels
+        self._merge_rule = (config.merge_overlap, config.merge_cosine)
         self.hash = VoxelHash(kernels, device)
         self.colors = Column(torch.uint8, _UNSEEN_COLOR, device, width=3)
         self.dense = DenseLayer(dimension, getattr(torch, config.dtype), kernels, device)
         self.instances = InstanceLayer(dimension, config.max_hypotheses, config.iou_threshold, kernels, device)
-        self.fused = FusedInstances(dimension, windowed, device)
+        self.fused = FusedInstances(dimension, windowed, device, keep_most_evidence)
 
     def slots(self, keys: Tensor) -> Tensor:
         """Slots of distinct keys, (n,) int64; voxels that the map lacks are made."""
@@ -56,6 +61,30 @@ class MapState:
         self.dense.reserve(count)
         self.instances.reserve(count)
         return slots
+
+    def integrate(self, slots: Tensor, proposals: Pairs, embeddings: Tensor, visible_keys: Tensor | None) -> Tensor:
+        """Give a keyframe's proposals to instances, then merge instances that have grown into one another if that is wanted.
+
+        Args:
+            slots: (n,) distinct slots of all proposals.
+            proposals: m groups of slots and N_i.
+            embeddings: (m, d) float32 unit vectors.
+            visible_keys: Distinct keys of what the keyframe saw, the proposals' own included; None where all voxels of an
+                instance count.
+
+        Returns:
+            Id that each proposal's instance has after that, (m,) int64, -1 for a proposal without points.
+        """
+        visible = None
+        if visible_keys is not None:
+            visible = self.hash.find(visible_keys)
+            visible = visible.masked_select(visible >= 0)
+        ids, created = self.instances.integrate(proposals, embeddings, visible)
+        self.fused.admit(created)
+        if self._merge_rule[0] > 0:
+            for gone, into in merge_overlapping(self._kernels, self.instances, self.fused, slots, *self._merge_rule):
+                ids.masked_fill_(ids == gone, into)
+        return ids
 
     def remove(self, slots: Tensor) -> None:
         """Forget the voxels of distinct slots, and instances that are left without one."""

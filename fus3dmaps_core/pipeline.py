@@ -79,6 +79,7 @@ class Pipeline:
             config.map,
             config.fusion.variance_ratio or trio.variance_ratio,
             config.fusion.window_radius_m,
+            config.fusion.keep_most_evidence,
         )
         gates = config.keyframes
         self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
@@ -102,7 +103,8 @@ class Pipeline:
             EncoderError: One of them is unknown, or its packages or weights are missing or altered.
         """
         segmenter = load_segmenter(config.segmenter.name, config.encoder.device)
-        trio = load_trio(config.encoder.name, config.encoder.device, config.segmenter.crop_padding)
+        encoder = config.encoder
+        trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
         warm_up(trio.dimension, config.map)
         return cls(config, trio, segmenter)
 
@@ -179,7 +181,7 @@ class Pipeline:
     def _integrate_instances(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
         with report.timed("segmentation"), naming_out_of_memory(f"segmenter '{self.config.segmenter.name}'"):
             masks = filter_masks(self._segmenter.segment(working.rgb, working.depth_m), self.config.segmenter)
-            proposals, ys, xs, masks = self._proposal_pixels(working, masks)
+            proposals, samples, ys, xs, masks = self._proposal_samples(working, masks)
         if not len(masks):
             return
         with report.timed("crop_encoder"):
@@ -188,14 +190,19 @@ class Pipeline:
                 len(masks),
             )
         with report.timed("instance_update"):
-            points = unproject(working.depth_m, ys, xs, working.intrinsics, T)
-            self.semantic_map.integrate_proposals(points, proposals, embeddings)
+            visible = unproject(working.depth_m, ys, xs, working.intrinsics, T)
+            self.semantic_map.integrate_proposals(visible.take(samples, axis=0), proposals, embeddings, visible)
         report.proposals = len(masks)
 
-    def _proposal_pixels(
+    def _proposal_samples(
         self, working: WorkingFrame, masks: Masks
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Masks]:
-        """Sampled pixels with depth inside each mask; masks without one are left out before their crop is encoded."""
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Masks]:
+        """Which sampled pixels with depth lie inside each mask.
+
+        Returns:
+            Proposal and sample, two (n,) int64, of each sample inside a mask; row and column, two (q,) int64, of all
+            samples; and the masks that have one: the others are left out before their crop is encoded.
+        """
         height, width = working.depth_m.shape
         rows, columns = self.trio.patch.grid(height, width)
         pixels = sample_pixels(height, width, rows, columns, self.config.sampling.instance_per_patch)
@@ -204,7 +211,7 @@ class Pipeline:
         inside = masks.masks[:, ys, xs]
         seen = np.flatnonzero(inside.any(axis=1))
         proposals, samples = np.nonzero(inside[seen])
-        return proposals, ys[samples], xs[samples], masks.take(seen)
+        return proposals, samples, ys, xs, masks.take(seen)
 
     def empty_map(self) -> SemanticMap:
         """Another map like this pipeline's, with nothing in it."""
@@ -213,6 +220,7 @@ class Pipeline:
             self.config.map,
             self.config.fusion.variance_ratio or self.trio.variance_ratio,
             self.config.fusion.window_radius_m,
+            self.config.fusion.keep_most_evidence,
         )
 
     def restore(self, semantic_map: SemanticMap, stamp_ns: int, camera_poses: NDArray[np.float64]) -> None:

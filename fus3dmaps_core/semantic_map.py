@@ -9,37 +9,47 @@ from __future__ import annotations
 import math
 import threading
 import time
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.errors import MapError, QueryError
+from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.kernels.protocols import Pairs, Texts
 from fus3dmaps_core.kernels.selection import select_kernels
 from fus3dmaps_core.layers.fusion import FusionInputs
-from fus3dmaps_core.layers.similarity import LAYERS, layer_named
+from fus3dmaps_core.layers.similarity import layer_named
 from fus3dmaps_core.map_input import check_state, float_tensor, index_tensor, unit_rows, voxel_keys, weight_tensor
 from fus3dmaps_core.map_state import MapState
 from fus3dmaps_core.memory_budget import KeyframeBound, MemoryUse
-from fus3dmaps_core.search import Finding, Question, Survey
+from fus3dmaps_core.search import Finding, Labelling, LayerOf, Question, Survey, unit_texts
 from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, VoxelSnapshot
 
 
 class SemanticMap:
     """A voxel map with a dense and an instance layer, thread-safe."""
 
-    def __init__(self, dimension: int, config: MapConfig, variance_ratio: float, window_radius_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        dimension: int,
+        config: MapConfig,
+        variance_ratio: float,
+        window_radius_m: float = 0.0,
+        keep_most_evidence: bool = True,
+    ) -> None:
         """Start empty.
 
         Args:
             dimension: Embedding width d.
-            config: Voxel size, hypotheses, association threshold, storage type, device and kernels.
+            config: Voxel size, hypotheses, rules of association and merging, storage type, device and kernels.
             variance_ratio: lambda = R^D / R^I.
             window_radius_m: Radius r_w of the sliding window, metres; 0 keeps the whole dense layer and makes fusion
                 replace every fused embedding, where a window keeps those of more evidence.
+            keep_most_evidence: False has fusion replace every fused embedding with a window too.
 
         Raises:
             ConfigError: The kernels that the configuration names do not run here.
@@ -48,6 +58,7 @@ class SemanticMap:
         self.config = config
         self.variance_ratio = variance_ratio
         self._given_radius_m = self._radius_m = window_radius_m
+        self._keep_most_evidence = keep_most_evidence
         self._device = torch.device(config.device)
         self._kernels = select_kernels(config.backend, self._device)
         self._lock = threading.RLock()
@@ -114,7 +125,7 @@ class SemanticMap:
             MapError: A shape, dtype, range or value is wrong.
         """
         keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = unit_rows("embeddings", embeddings, self.dimension, self._kernels, self._device)
+        unit = self._unit_rows("embeddings", embeddings)
         patch_index = index_tensor("patches", patches, len(points_m), len(embeddings), self._device)
         patch_weights = weight_tensor(weights, len(embeddings), self._device)
         if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
@@ -135,25 +146,35 @@ class SemanticMap:
             self._state.instances.touch(self._state.dense.accumulate(slots, keys, observations, unit, patch_weights))
 
     def integrate_proposals(
-        self, points_m: NDArray[np.floating], proposals: NDArray[np.integer], embeddings: NDArray[np.floating]
+        self,
+        points_m: NDArray[np.floating],
+        proposals: NDArray[np.integer],
+        embeddings: NDArray[np.floating],
+        visible_points_m: NDArray[np.floating] | None = None,
     ) -> NDArray[np.int64]:
         """Associate a keyframe's proposals with instances, in order [sec: Instance-Level Semantic Voxel Mapping].
+
+        With ``map.merge_overlap`` those that have grown into one another then merge: :mod:`fus3dmaps_core.layers.merging`.
 
         Args:
             points_m: (n, 3) in the map frame, metres; a pixel that lies in several masks appears once for each.
             proposals: (n,) proposal of each point, in [0, m).
             embeddings: (m, d), one per proposal, any length but 0.
+            visible_points_m: (q, 3) what the keyframe saw, in proposals or not, for association by ``visible_iou``; the
+                proposals' own points need not be among them. Association by ``iou`` does not look at them.
 
         Returns:
-            (m,) int64 id that each proposal was given, -1 for one without a point. A later proposal of the same call may
-            have displaced an earlier one's instance altogether.
+            (m,) int64 id that each proposal was given, -1 for one without a point; of an instance that was merged, the id of
+            the one that took it in. A later proposal of the same call may have displaced an earlier one's instance
+            altogether.
 
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
         keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = unit_rows("embeddings", embeddings, self.dimension, self._kernels, self._device)
+        unit = self._unit_rows("embeddings", embeddings)
         proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
+        visible_keys = self._visible_keys(keys, visible_points_m)
         if not len(keys):
             return np.full(len(embeddings), -1, np.int64)
         keys, voxels, _ = self._kernels.distinct(keys)
@@ -162,8 +183,7 @@ class SemanticMap:
             self._state.instances.check_room(len(unit))
             slots = self._state.slots(keys)
             groups = Pairs(pairs.offsets, slots.index_select(0, pairs.partners), pairs.counts)
-            ids, created = self._state.instances.integrate(groups, unit)
-            self._state.fused.admit(created)
+            ids = self._state.integrate(slots, groups, unit, visible_keys)
         return ids.cpu().numpy()
 
     def set_window_radius(self, radius_m: float) -> None:
@@ -270,7 +290,7 @@ class SemanticMap:
 
         Without a window every fused embedding becomes that of the map as it is. With one, only those are replaced whose new
         evidence is greater than the stored evidence, so that an object keeps what it had gathered when its dense voxels
-        have left the window.
+        have left the window; unless the map was made to replace them always.
 
         Args:
             full: Compute every instance. Otherwise only those that have changed since are computed, with the same result.
@@ -328,18 +348,27 @@ class SemanticMap:
             QueryError: The layer is unknown, or there is no prompt.
             MapError: The texts have the wrong shape or are not finite.
         """
-        if layer not in LAYERS:
-            raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
         given = {"prompts": prompts} | ({} if negatives is None else {"negatives": negatives})
-        vectors = [unit_rows(name, each, self.dimension, self._kernels, self._device) for name, each in given.items()]
-        if not len(vectors[0]):
-            raise QueryError("prompts: at least one prompt is needed")
+        vectors = unit_texts(layer, given, self._unit_rows)
         texts = Texts(torch.cat(vectors), len(vectors[0]), logit_scale)
         with self._lock:
-            inputs, fused = self._fusion_inputs(), self._state.fused
-            return Survey(self._state, self._kernels, self.config.voxel_size_m).search(
-                lambda texts: layer_named(layer, inputs, fused, texts), Question(texts, threshold, top_k, min_voxels)
-            )
+            survey = Survey(self._state, self._kernels, self.config.voxel_size_m)
+            return survey.search(self._layer(layer), Question(texts, threshold, top_k, min_voxels))
+
+    def label(self, layer: str, texts: NDArray[np.floating]) -> Labelling:
+        """Which of some texts fits each voxel of a layer best, and each instance; otherwise as :meth:`search`.
+
+        Args:
+            layer: One of LAYERS.
+            texts: (p, d) text embeddings, any length but 0.
+
+        Raises:
+            QueryError: The layer is unknown, or there is no text.
+            MapError: The texts have the wrong shape or are not finite.
+        """
+        (vectors,) = unit_texts(layer, {"texts": texts}, self._unit_rows)
+        with self._lock:
+            return Survey(self._state, self._kernels, self.config.voxel_size_m).label(self._layer(layer), vectors)
 
     def export_state(self) -> dict[str, NDArray[Any]]:
         """Everything the map holds, as arrays by name: what a map file stores and what :meth:`import_state` reads.
@@ -362,8 +391,26 @@ class SemanticMap:
         with self._lock:
             self._state = fresh
 
+    def _visible_keys(self, keys: Tensor, visible_points_m: NDArray[np.floating] | None) -> Tensor | None:
+        """Distinct keys of what a keyframe saw, its proposals' included; None where association does not ask."""
+        if self.config.association != "visible_iou":
+            return None
+        if visible_points_m is not None:
+            try:
+                seen = voxel_keys(visible_points_m, self.config.voxel_size_m, self._kernels, self._device)
+            except MapError as error:
+                raise MapError(f"visible_{error}") from None  # It speaks of points_m.
+            keys = torch.cat([keys, seen])
+        return self._kernels.distinct(keys)[0]
+
+    def _unit_rows(self, name: str, embeddings: NDArray[np.floating]) -> Tensor:
+        return unit_rows(name, embeddings, self.dimension, self._kernels, self._device)
+
+    def _layer(self, name: str) -> LayerOf:
+        return partial(layer_named, name, self._fusion_inputs(), self._state.fused)
+
     def _empty_state(self) -> MapState:
-        return MapState(self.dimension, self.config, self._given_radius_m > 0, self._kernels)
+        return MapState(self.dimension, self.config, self._given_radius_m > 0, self._kernels, self._keep_most_evidence)
 
     def _fusion_inputs(self) -> FusionInputs:
         return FusionInputs(self._kernels, self._state.dense, self._state.instances, self.variance_ratio)

@@ -139,7 +139,11 @@ def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo
     try:
         map_config = MapConfig.model_validate({**info.config.map.model_dump(), "device": device})
         semantic_map = SemanticMap(
-            manifest.dimension, map_config, manifest.variance_ratio, info.config.fusion.window_radius_m
+            manifest.dimension,
+            map_config,
+            manifest.variance_ratio,
+            info.config.fusion.window_radius_m,
+            info.config.fusion.keep_most_evidence,
         )
         semantic_map.import_state(arrays)
     except (ValueError, ConfigError, MapError) as error:

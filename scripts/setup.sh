@@ -14,7 +14,7 @@ BUILD=$ROOT/build
 LOG=$BUILD/setup.log
 STAMPS=$VENV/.fus3dmaps
 SUPPORTED="3.11 or 3.12"
-EXTRAS=(lite ros-pypi build test dev)
+EXTRAS=(lite evaluation ros-pypi build test dev)
 
 # A ROS set-up or another such environment in the calling shell must not reach into this one. The last two are set by the
 # ROS wheels in every process they start.

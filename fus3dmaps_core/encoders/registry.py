@@ -11,7 +11,10 @@ from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
 _TRIOS = {
+    "clip_dinoiser": "fus3dmaps_core.encoders.clip_dinoiser",
     "lite": "fus3dmaps_core.encoders.lite",
+    "naradio": "fus3dmaps_core.encoders.radio.naradio",
+    "radseg": "fus3dmaps_core.encoders.radio.radseg",
 }
 
 
@@ -20,29 +23,30 @@ def names() -> list[str]:
     return sorted(_TRIOS)
 
 
-def load_trio(name: str, device: str, crop_padding: float) -> EncoderTrio:
-    """Load the three encoders of a trio; its module's ``load_trio(device, crop_padding)`` builds them.
+def load_trio(name: str, device: str, crop_padding: float, weights: str = "") -> EncoderTrio:
+    """Load the three encoders of a trio; its module's ``load_trio(device, crop_padding, weights)`` builds them.
 
     Args:
         name: Registry name.
         device: Torch device, e.g. ``cpu`` or ``cuda:0``.
         crop_padding: Padding around a mask's box, as a share of its size.
+        weights: Where its weights are, see :mod:`fus3dmaps_core.encoders.weights`; "" for the published ones.
 
     Raises:
         EncoderError: The name is unknown, or its packages or weights are missing or altered.
     """
-    load = cast(Callable[[str, float], EncoderTrio], _module(name).load_trio)
-    return load(device, crop_padding)
+    load = cast(Callable[[str, float, str], EncoderTrio], _module(name).load_trio)
+    return load(device, crop_padding, weights)
 
 
-def load_text_encoder(name: str, device: str) -> TextEncoder:
+def load_text_encoder(name: str, device: str, weights: str = "") -> TextEncoder:
     """Load the text encoder alone, which is all that a query of a saved map needs.
 
     Raises:
         EncoderError: As :func:`load_trio`.
     """
-    load = cast(Callable[[str], TextEncoder], _module(name).load_text_encoder)
-    return load(device)
+    load = cast(Callable[[str, str], TextEncoder], _module(name).load_text_encoder)
+    return load(device, weights)
 
 
 def _module(name: str) -> ModuleType:

@@ -111,7 +111,13 @@ class CompiledKernels:
         self._share(numba_rows.merge_means, len(rows), pool.dimension, *pooled, *(each.numpy() for each in arrays))
 
     def integrate(
-        self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
+        self,
+        hypotheses: Hypotheses,
+        proposals: Pairs,
+        spare_rows: Tensor,
+        next_id: int,
+        iou_threshold: float,
+        hidden_of_row: Tensor | None = None,
     ) -> Association:
         """As the protocol says."""
         matched, ids = (np.empty(len(proposals.offsets) - 1, np.int64) for _ in range(2))
@@ -123,6 +129,7 @@ class CompiledKernels:
             spare_rows.numpy(),
             next_id,
             iou_threshold,
+            np.empty(0, np.int32) if hidden_of_row is None else hidden_of_row.numpy(),
             hypotheses.held_row.numpy(),
             hypotheses.held_count.numpy(),
             hypotheses.id_of_row.numpy(),
@@ -135,6 +142,33 @@ class CompiledKernels:
         )
         died_rows = torch.from_numpy(dead[:died].copy())
         return Association(torch.from_numpy(matched), torch.from_numpy(ids), int(created), died_rows)
+
+    def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """As the protocol says."""
+        with self._scratch.lend((len(held_row),), np.int64) as slots:
+            found = numba_instances.holders(held_row.numpy(), rows.numpy(), np.zeros(row_count, np.bool_), slots)
+            return torch.from_numpy(slots[:found].copy())
+
+    def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """As the protocol says."""
+        shared = np.zeros((len(rows), len(rows)), np.int64)
+        numba_instances.shared_voxels(held_row.numpy(), rows.numpy(), np.full(row_count, -1, np.int32), shared)
+        return torch.from_numpy(shared)
+
+    def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
+        """As the protocol says."""
+        numba_instances.merge(
+            slots.numpy(),
+            gone.numpy(),
+            into.numpy(),
+            np.full(len(hypotheses.id_of_row), -1, np.int32),
+            hypotheses.held_row.numpy(),
+            hypotheses.held_count.numpy(),
+            hypotheses.id_of_row.numpy(),
+            hypotheses.voxels_of_row.numpy(),
+            hypotheses.observations_of_row.numpy(),
+            hypotheses.changed.numpy(),
+        )
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
         """As the protocol says."""
@@ -167,7 +201,8 @@ class CompiledKernels:
             known += [sums.members.numpy(), sums.totals.numpy()]
         else:
             known += [np.empty(0, np.int64), np.empty((0, 0), np.int64)]
-        room_m, room = room_for.centers_m.numpy(), room_for.best.numpy()
+        room = [room_for.centers_m.numpy(), room_for.best.numpy()]
+        room.append(np.empty(0, np.int32) if room_for.which is None else room_for.which.numpy())
         adding = threading.Lock()
 
         def look(number: int, first: int, last: int) -> None:
@@ -181,7 +216,7 @@ class CompiledKernels:
                 part_of_row.fill(-1)
                 table = (part_of_row, row_of_part, part_extents, part_sums)
                 numbers = (block.first + first, *(each[here] for each in voxels), block.voxel_size_m)
-                results = numba_scan.scan(*numbers, *held, *asked, threshold, *table, room_m[here], room[here])
+                results = numba_scan.scan(*numbers, *held, *asked, threshold, *table, *(each[here] for each in room))
                 used, found[number], kept[number] = results
                 with adding:
                     numba_scan.add_parts(*(each[:used] for each in table[1:]), *known)
@@ -190,7 +225,7 @@ class CompiledKernels:
         end = 0
         for (first, _), count in zip(parts, kept, strict=True):
             if first != end:
-                for array in (room_m, room):
+                for array in room:
                     array[end : end + count] = array[first : first + count].copy()
             end += count
         return sum(found), end

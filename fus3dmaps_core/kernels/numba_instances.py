@@ -1,4 +1,4 @@
-"""Compiled loops over proposals and hypotheses: association, counting and displacement.
+"""Compiled loops over proposals and hypotheses: association, counting, displacement and merging.
 
 Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
 """
@@ -23,6 +23,7 @@ def _best_match(
     held_row: NDArray[np.int32],
     id_of_row: NDArray[np.int64],
     voxels_of_row: NDArray[np.int32],
+    hidden_of_row: NDArray[np.int32],
     iou_threshold: float,
     seen_by: NDArray[np.int32],
     shared: NDArray[np.int32],
@@ -44,7 +45,10 @@ def _best_match(
     best_row, best = -1, iou_threshold
     for row in candidates[:found]:
         # Correctly rounded float64 quotients: equal ratios compare equal, and 1/5 is not above 0.2.
-        iou = np.float64(shared[row]) / np.float64(len(slots) + voxels_of_row[row] - shared[row])
+        union = len(slots) + voxels_of_row[row] - shared[row]
+        if len(hidden_of_row):
+            union -= hidden_of_row[row]
+        iou = np.float64(shared[row]) / np.float64(union)
         if iou > best or (best_row >= 0 and iou == best and id_of_row[row] < id_of_row[best_row]):
             best_row, best = row, iou
     return best_row
@@ -58,6 +62,7 @@ def integrate(
     spare_rows: NDArray[np.int64],
     next_id: int,
     iou_threshold: float,
+    hidden_of_row: NDArray[np.int32],
     held_row: NDArray[np.int32],
     held_count: NDArray[np.int32],
     id_of_row: NDArray[np.int64],
@@ -77,6 +82,7 @@ def integrate(
         spare_rows: (m,) rows for new instances, taken from the front.
         next_id: Id of the next new instance.
         iou_threshold: An IoU must be larger than this to match.
+        hidden_of_row: How many of an instance's voxels do not count in the IoU's union; empty where all count.
         held_row: (slots, K) rows of the hypotheses, -1 where empty; changed.
         held_count: (slots, K) their counts; changed.
         id_of_row: Ids; written for new instances, -1 for those that died.
@@ -100,7 +106,8 @@ def integrate(
         if len(own) == 0:
             matched[proposal] = ids[proposal] = -1
             continue
-        row = _best_match(proposal, own, held_row, id_of_row, voxels_of_row, iou_threshold, seen_by, shared, candidates)
+        known = (held_row, id_of_row, voxels_of_row, hidden_of_row)
+        row = _best_match(proposal, own, *known, iou_threshold, seen_by, shared, candidates)
         if row < 0:
             row = spare_rows[created]
             id_of_row[row] = next_id + created
@@ -145,3 +152,118 @@ def integrate(
         for i in range(first_dead, died):
             id_of_row[dead[i]] = -1
     return created, died
+
+
+@njit(**_OPTIONS)
+def holders(
+    held_row: NDArray[np.int32], rows: NDArray[np.int64], is_wanted: NDArray[np.bool_], slots: NDArray[np.int64]
+) -> int:
+    """Find the slots that hold any of some instances.
+
+    Args:
+        held_row: (slots, K) rows of the hypotheses, -1 where empty.
+        rows: (m,) rows of the instances.
+        is_wanted: False everywhere; written: True for them.
+        slots: Written: the slots, ascending.
+
+    Returns:
+        How many there are.
+    """
+    found = 0
+    for row in rows:
+        is_wanted[row] = True
+    for slot in range(len(held_row) if len(rows) else 0):
+        for k in range(held_row.shape[1]):
+            row = held_row[slot, k]
+            if row >= 0 and is_wanted[row]:
+                slots[found] = slot
+                found += 1
+                break
+    return found
+
+
+@njit(**_OPTIONS)
+def shared_voxels(
+    held_row: NDArray[np.int32], rows: NDArray[np.int64], place_of_row: NDArray[np.int32], shared: NDArray[np.int64]
+) -> None:
+    """Count the voxels that each two of some instances share.
+
+    Args:
+        held_row: (slots, K) rows of the hypotheses, -1 where empty.
+        rows: (m,) rows of the instances.
+        place_of_row: -1 everywhere; written: place of each of them.
+        shared: (m, m) zeros; written, on the diagonal how many voxels each has.
+    """
+    for place in range(len(rows)):
+        place_of_row[rows[place]] = place
+    places = held_row.shape[1]
+    for slot in range(len(held_row)):
+        for k in range(places):
+            row = held_row[slot, k]
+            place = place_of_row[row] if row >= 0 else -1
+            if place < 0:
+                continue
+            shared[place, place] += 1
+            for j in range(k):
+                other_row = held_row[slot, j]
+                other = place_of_row[other_row] if other_row >= 0 else -1
+                if other >= 0:
+                    shared[place, other] += 1
+                    shared[other, place] += 1
+
+
+@njit(**_OPTIONS)
+def merge(
+    slots: NDArray[np.int64],
+    gone: NDArray[np.int64],
+    into: NDArray[np.int64],
+    target_of_row: NDArray[np.int32],
+    held_row: NDArray[np.int32],
+    held_count: NDArray[np.int32],
+    id_of_row: NDArray[np.int64],
+    voxels_of_row: NDArray[np.int32],
+    observations_of_row: NDArray[np.int64],
+    changed: NDArray[np.bool_],
+) -> None:
+    """Let instances take in others.
+
+    Args:
+        slots: Distinct slots, those that hold any of the instances that are taken in among them.
+        gone: (n,) rows of the instances that are taken in.
+        into: (n,) rows of those that take them in, none of them gone.
+        target_of_row: -1 everywhere; written: where each row that is gone goes.
+        held_row: (slots, K) rows of the hypotheses, -1 where empty; changed.
+        held_count: (slots, K) their counts; changed.
+        id_of_row: Ids; -1 for those that are gone.
+        voxels_of_row: |V_id|; changed.
+        observations_of_row: Sum of counts over V_id; changed.
+        changed: Set for instances that took another in.
+    """
+    for i in range(len(gone)):
+        target_of_row[gone[i]] = into[i]
+        id_of_row[gone[i]] = -1
+        voxels_of_row[gone[i]] = observations_of_row[gone[i]] = 0
+        changed[into[i]] = True
+    places = held_row.shape[1]
+    for slot in slots:
+        for k in range(places):
+            row = held_row[slot, k]
+            target = target_of_row[row] if row >= 0 else -1
+            if target < 0:
+                continue
+            own = -1
+            for j in range(places):
+                if held_row[slot, j] == target:
+                    own = j
+            arrived = np.int64(held_count[slot, k])
+            if own < 0:
+                held_row[slot, k] = target
+                voxels_of_row[target] += 1
+                observations_of_row[target] += arrived
+                continue
+            before = np.int64(held_count[slot, own])
+            after = min(before + arrived, np.int64(MAX_COUNT))
+            held_count[slot, own] = after
+            observations_of_row[target] += after - before
+            held_row[slot, k] = -1
+            held_count[slot, k] = 0

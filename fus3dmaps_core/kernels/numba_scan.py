@@ -176,14 +176,20 @@ def _keep(
     threshold: float,
     centers_m: NDArray[np.float32],
     best: NDArray[np.float32],
+    which: NDArray[np.int32],
 ) -> int:
-    """Write centre and best score of the voxels that reach a threshold; returns how many do."""
+    """Write centre, best score and its prompt of the voxels that reach a threshold; returns how many do."""
     kept = np.uint64(0)
     for i in range(len(scores)):
         score = scores[i, 0]
         for p in range(1, scores.shape[1]):
             score = max(score, scores[i, p])
         if score >= threshold:
+            if len(which) > 0:
+                prompt = 0
+                while scores[i, prompt] < score:
+                    prompt += 1
+                which[kept] = prompt
             x, y, z = _coordinates(keys[picked[i]])
             centers_m[kept, 0] = np.float32((np.float64(x) + 0.5) * voxel_size_m)
             centers_m[kept, 1] = np.float32((np.float64(y) + 0.5) * voxel_size_m)
@@ -223,6 +229,7 @@ def scan(
     sums: NDArray[np.int64],
     centers_m: NDArray[np.float32],
     best: NDArray[np.float32],
+    which: NDArray[np.int32],
 ) -> tuple[int, int, int]:
     """Look at consecutive slots.
 
@@ -255,6 +262,7 @@ def scan(
         sums: (m, p + 1) written: their voxels' scores in steps of 1 / SCORE_UNIT, and how many voxels have the layer.
         centers_m: (n, 3) written from the front: centres of the voxels that are kept.
         best: (n,) written from the front: their best scores.
+        which: (n,) written from the front: the first prompt that has it; (0,) where nobody asks.
 
     Returns:
         How many instances were written, how many voxels have the layer, and how many of these were kept.
@@ -292,7 +300,7 @@ def scan(
             scores = relevancy
         _add_scores(scores, picked, top_row, part_of_row, sums)
         found += len(picked)
-        kept += _keep(here, voxel_size_m, picked, scores, threshold, centers_m[kept:], best[kept:])
+        kept += _keep(here, voxel_size_m, picked, scores, threshold, centers_m[kept:], best[kept:], which[kept:])
     for part in range(parts):
         part_of_row[row_of_part[part]] = -1
     return parts, found, kept

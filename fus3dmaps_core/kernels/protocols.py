@@ -174,10 +174,12 @@ class ScoredVoxels:
     Attributes:
         centers_m: (n, 3) float32, metres.
         best: (n,) float32 best score over the prompts.
+        which: (n,) int32 the prompt that has it, of equal ones the first; None where nobody asks.
     """
 
     centers_m: Tensor
     best: Tensor
+    which: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -280,7 +282,13 @@ class Kernels(Protocol):
         ...
 
     def integrate(
-        self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
+        self,
+        hypotheses: Hypotheses,
+        proposals: Pairs,
+        spare_rows: Tensor,
+        next_id: int,
+        iou_threshold: float,
+        hidden_of_row: Tensor | None = None,
     ) -> Association:
         """Associate proposals in order and count them, each against the map as the previous one left it.
 
@@ -290,6 +298,38 @@ class Kernels(Protocol):
             spare_rows: (m,) int64 rows for new instances, taken from the front.
             next_id: Id of the next new instance.
             iou_threshold: An IoU must be larger than this to match.
+            hidden_of_row: (rows,) int32, how many of an instance's voxels do not count in the IoU's union, none of them one
+                of a proposal's; None where all count.
+        """
+        ...
+
+    def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """Slots that hold any of some instances, (n,) int64 ascending; the arguments are those of :meth:`shared_voxels`."""
+        ...
+
+    def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """How many voxels each two of some instances share, in one pass over slots.
+
+        Args:
+            held_row: (slots, K) int32 rows that each slot holds, -1 where empty.
+            rows: (m,) int64 distinct rows of the instances.
+            row_count: One more than the largest row held.
+
+        Returns:
+            (m, m) int64, symmetrical; on the diagonal how many voxels each has.
+        """
+        ...
+
+    def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
+        """Let instances take in others.
+
+        Where a voxel holds both, the counts are added; elsewhere the hypothesis changes its instance.
+
+        Args:
+            hypotheses: Changed: of rows that are gone nothing is left, id and all.
+            slots: (s,) int64 distinct slots, all that hold any of those that are taken in among them.
+            gone: (n,) int64 distinct rows of the instances that are taken in.
+            into: (n,) int64 rows of those that take them in, none of them gone; one may take in several.
         """
         ...
 

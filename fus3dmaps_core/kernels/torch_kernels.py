@@ -31,6 +31,7 @@ from fus3dmaps_core.memory.rows import RowPool
 
 _COUNT_UNIT = 2**32  # Orders by count first, then by id, in one integer.
 _READ_ROWS = 2048  # Rows that are decoded at once, so that memory stays bounded.
+_SCANNED_SLOTS = 2**17  # Of hypotheses, the same.
 
 
 class TorchKernels:
@@ -120,7 +121,13 @@ class TorchKernels:
         pool.write(rows, means.mul_((old / new)[:, None]).add_(sums.div_(new[:, None])), seeds, scales)
 
     def integrate(
-        self, hypotheses: Hypotheses, proposals: Pairs, spare_rows: Tensor, next_id: int, iou_threshold: float
+        self,
+        hypotheses: Hypotheses,
+        proposals: Pairs,
+        spare_rows: Tensor,
+        next_id: int,
+        iou_threshold: float,
+        hidden_of_row: Tensor | None = None,
     ) -> Association:
         """As the protocol says."""
         matched, ids, dead, created = [], [], [], 0
@@ -132,7 +139,7 @@ class TorchKernels:
                 continue
             slots, counts = proposals.partners[start:end], proposals.counts[start:end]
             held = hypotheses.held_row[slots].to(torch.int64)
-            row = _best_match(hypotheses, held, len(slots), iou_threshold)
+            row = _best_match(hypotheses, held, len(slots), iou_threshold, hidden_of_row)
             if row is None:
                 row = int(spare_rows[created])
                 hypotheses.id_of_row[row] = next_id + created
@@ -144,6 +151,40 @@ class TorchKernels:
         died = torch.cat(dead) if dead else torch.zeros(0, dtype=torch.int64, device=device)
         rows, given = (torch.tensor(each, dtype=torch.int64, device=device) for each in (matched, ids))
         return Association(rows, given, created, died)
+
+    def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """As the protocol says."""
+        if not len(rows):
+            return rows
+        is_wanted = torch.zeros(row_count + 1, dtype=torch.bool, device=held_row.device)
+        is_wanted[rows] = True  # Row -1, an empty place, finds the last one.
+        holds = [is_wanted[part.to(torch.int64)].any(dim=1) for part in torch.split(held_row, _SCANNED_SLOTS)]
+        return torch.nonzero(torch.cat(holds)).squeeze(1)
+
+    def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
+        """As the protocol says."""
+        count = len(rows)
+        place_of_row = torch.full((row_count + 1,), -1, dtype=torch.int64, device=held_row.device)
+        place_of_row[rows] = torch.arange(count, device=held_row.device)  # Row -1, an empty place, finds the last one.
+        shared = torch.zeros(count * count, dtype=torch.int64, device=held_row.device)
+        for part in torch.split(held_row, _SCANNED_SLOTS):
+            places = place_of_row[part.to(torch.int64)]
+            for k in range(places.shape[1]):
+                both = (places[:, k, None] >= 0) & (places >= 0)
+                pairs = (places[:, k, None] * count + places)[both]
+                shared.index_add_(0, pairs, torch.ones_like(pairs))
+        return shared.view(count, count)
+
+    def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
+        """As the protocol says."""
+        target_of_row = torch.full((len(hypotheses.id_of_row) + 1,), -1, dtype=torch.int64, device=slots.device)
+        target_of_row[gone] = into  # Row -1, an empty place, finds the last one.
+        hypotheses.id_of_row[gone] = -1
+        hypotheses.voxels_of_row[gone] = 0
+        hypotheses.observations_of_row[gone] = 0
+        hypotheses.changed[into] = True
+        for part in torch.split(slots, _SCANNED_SLOTS):
+            _rename(hypotheses, part, target_of_row)
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
         """As the protocol says."""
@@ -188,10 +229,12 @@ class TorchKernels:
             rows = rows[belong]
             sums.members.index_add_(0, rows, torch.ones_like(rows))
             sums.totals.index_add_(0, rows, (scores[belong] * SCORE_UNIT).to(torch.int64))
-        best = scores.amax(dim=1) if len(scores) else scores.new_zeros(0)
+        best, which = scores.max(dim=1)  # Of equal ones the first.
         kept = best >= threshold
         count = int(kept.sum())
         room_for.best[:count] = best[kept]
+        if room_for.which is not None:
+            room_for.which[:count] = which[kept].to(torch.int32)
         room_for.centers_m[:count] = self.centers(block.keys[picked[kept]], block.voxel_size_m)
         return len(picked), count
 
@@ -289,13 +332,17 @@ def _weighted_sums(voxels: Fusable, place_of_instance: Tensor, places: int) -> t
     return sums, totals
 
 
-def _best_match(hypotheses: Hypotheses, held: Tensor, size: int, iou_threshold: float) -> int | None:
+def _best_match(
+    hypotheses: Hypotheses, held: Tensor, size: int, iou_threshold: float, hidden_of_row: Tensor | None
+) -> int | None:
     """Row of the instance with the largest IoU above the threshold (ties: the lowest id) among those held."""
     candidates, shared = torch.unique(held[held >= 0], return_counts=True)
     if not len(candidates):
         return None
     # Correctly rounded float64 quotients: equal ratios compare equal, and 1/5 is not above 0.2.
     union = size + hypotheses.voxels_of_row[candidates].to(torch.int64) - shared
+    if hidden_of_row is not None:
+        union -= hidden_of_row[candidates]
     iou = shared.to(torch.float64) / union.to(torch.float64)
     best = float(iou.max())
     if best <= iou_threshold:
@@ -330,3 +377,24 @@ def _count(hypotheses: Hypotheses, slots: Tensor, counts: Tensor, held: Tensor, 
     dead: Tensor = losers[hypotheses.voxels_of_row[losers] == 0]
     hypotheses.id_of_row[dead] = -1
     return dead
+
+
+def _rename(hypotheses: Hypotheses, slots: Tensor, target_of_row: Tensor) -> None:
+    """Give the hypotheses of rows that have a target to it, in distinct slots."""
+    held = hypotheses.held_row[slots].to(torch.int64)
+    counts = hypotheses.held_count[slots].to(torch.int64)
+    for k in range(held.shape[1]):
+        where = torch.nonzero(target_of_row[held[:, k]] >= 0).squeeze(1)
+        targets, arrived = target_of_row[held[where, k]], counts[where, k]
+        is_own = held[where] == targets[:, None]
+        known, own = is_own.any(dim=1), is_own.to(torch.int64).argmax(dim=1)
+        before = torch.where(known, counts[where, own], 0)
+        after = (before + arrived).clamp(max=MAX_COUNT)
+        column = torch.where(known, own, k)
+        # Its place is emptied, unless it is there that the target goes.
+        held[where, k], counts[where, k] = -1, 0
+        held[where, column], counts[where, column] = targets, after
+        hypotheses.voxels_of_row.index_add_(0, targets, (~known).to(torch.int32))
+        hypotheses.observations_of_row.index_add_(0, targets, after - before)
+    hypotheses.held_row[slots] = held.to(torch.int32)
+    hypotheses.held_count[slots] = counts.to(torch.int32)

@@ -22,10 +22,11 @@ class FusedInstances:
     changed since are not computed again.
     """
 
-    def __init__(self, dimension: int, windowed: bool, device: torch.device) -> None:
-        """Start empty."""
+    def __init__(self, dimension: int, windowed: bool, device: torch.device, keep_most_evidence: bool = True) -> None:
+        """Start empty; only with a window does it matter what is kept."""
         self._device = device
         self._windowed = windowed
+        self._keep_most_evidence = keep_most_evidence
         self._stored = RowPool(dimension, torch.float32, device)
         self._evidence = Column(torch.float64, 0.0, device)
         self._current = RowPool(dimension, torch.float32, device)
@@ -50,7 +51,9 @@ class FusedInstances:
         """Bring what is stored up to date.
 
         Without a window the fused embedding of every instance is that of the map as it is. With one, an instance gets its
-        new fused embedding only if the new evidence is greater than the stored one [sec: Sliding Window].
+        new fused embedding only if the new evidence is greater than the stored one [sec: Sliding Window]; unless the most
+        evidence is not kept: then it gets it always. Of an instance none of whose voxels has a dense embedding left, that
+        is its own embedding f_id.
 
         Args:
             inputs: What is fused.
@@ -71,10 +74,31 @@ class FusedInstances:
             self._unstored[pending] = False
             return len(alive), len(rows)
         before = self._evidence[rows]
-        evidence = fuse_instances(inputs, rows, before, self._stored, _FUSE_SUM_BYTES)
-        self._evidence[rows] = torch.maximum(before, evidence)
+        bars = before if self._keep_most_evidence else torch.full_like(before, -torch.inf)
+        evidence = fuse_instances(inputs, rows, bars, self._stored, _FUSE_SUM_BYTES)
+        self._evidence[rows] = torch.maximum(bars, evidence)
         instances.settle(rows)
-        return int((evidence > before).sum()), len(rows)
+        return int((evidence > before).sum()) if self._keep_most_evidence else len(alive), len(rows)
+
+    def merge(self, gone: Tensor, into: Tensor) -> None:
+        """Let instances that take in others have what was stored with more evidence: of equal evidence, their own.
+
+        Args:
+            gone: (n,) rows of the instances that are taken in.
+            into: (n,) rows of those that take them in, none of them gone; one may take in several, and of equal evidence
+                has what was stored for the first.
+        """
+        owners = into.tolist()
+        most = dict(zip(owners, self._evidence[into].tolist(), strict=True))
+        best: dict[int, int] = {}
+        for row, owner, evidence in zip(gone.tolist(), owners, self._evidence[gone].tolist(), strict=True):
+            if evidence > most[owner]:
+                most[owner], best[owner] = evidence, row
+        sources, targets = (
+            torch.tensor(list(each), dtype=torch.int64, device=self._device) for each in (best.values(), best)
+        )
+        self._stored.write(targets, self._stored.read(sources))
+        self._evidence[targets] = self._evidence[sources]
 
     def restore(self, rows: Tensor, fused: Tensor, evidence: Tensor) -> None:
         """Store fused embeddings (n, d) and evidence (n,), 0 for none."""

@@ -125,24 +125,41 @@ class InstanceLayer:
         far = torch.full_like(nowhere, 2**62)
         return Extents(voxels=none, counts=none.clone(), sums=nowhere, low=far, high=-far)
 
-    def integrate(self, proposals: Pairs, embeddings: Tensor) -> tuple[Tensor, Tensor]:
+    def integrate(self, proposals: Pairs, embeddings: Tensor, visible: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Associate proposals with instances, in order, and update both [sec: Geometric Instance Association].
 
         Args:
             proposals: m groups: the distinct slots of V_m, and N_i, the proposal's points in each of them.
             embeddings: (m, d) float32 unit vectors.
+            visible: (v,) distinct slots, those of all proposals among them. With them an IoU's union counts no other voxel
+                of an instance: |V_m n V_id| / |V_m u (V_id n V_visible)|.
 
         Returns:
             Id of each proposal's instance, (m,) int64, -1 for one without points; and rows of the instances that it made.
         """
         spare = self.pool.allocate(len(embeddings))
         self._reserve_rows()
-        outcome = self._kernels.integrate(self.columns(), proposals, spare, self.next_id, self._iou_threshold)
-        self._average(outcome.rows, proposals, embeddings)
+        hidden = None if visible is None else self._hidden(visible)
+        outcome = self._kernels.integrate(self.columns(), proposals, spare, self.next_id, self._iou_threshold, hidden)
+        ends = torch.zeros(len(proposals.counts) + 1, dtype=torch.int64, device=self._device)
+        ends[1:] = torch.cumsum(proposals.counts, 0)
+        self._average(outcome.rows, ends.index_select(0, proposals.offsets).diff(), embeddings)
         self.next_id += outcome.created
         self.pool.free(spare[outcome.created :])
         self._bury(outcome.dead)
         return outcome.ids, spare[: outcome.created]
+
+    def take_in(self, gone: Tensor, into: Tensor, slots: Tensor) -> None:
+        """Merge instances into others: f = (w f + w_gone f_gone) / (w + w_gone), w += w_gone, and counts are added.
+
+        Args:
+            gone: (n,) distinct rows of the instances that are taken in, and given up.
+            into: (n,) rows of those that take them in, none of them gone; one may take in several.
+            slots: Distinct slots, all that hold one of those that are taken in among them.
+        """
+        self._kernels.merge(self.columns(), slots, gone, into)
+        self._average(into, self._weight_of_row[gone], self.pool.read(gone))
+        self._bury(gone)
 
     def forget(self, slots: Tensor) -> None:
         """Empty the hypotheses of distinct slots; instances left without voxel die."""
@@ -213,16 +230,29 @@ class InstanceLayer:
         for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
             column.reserve(self.pool.high_water)
 
-    def _average(self, rows: Tensor, proposals: Pairs, embeddings: Tensor) -> None:
-        """f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the proposals given to an instance."""
+    def _hidden(self, visible: Tensor) -> Tensor:
+        """How many voxels each instance has outside of distinct slots: (rows,) int32.
+
+        It stays the same while proposals are integrated all of whose slots are among them.
+        """
+        held = self._held_row[visible]
+        seen = torch.bincount(held.masked_select(held >= 0), minlength=self.pool.high_water)
+        return self._voxels_of_row[: self.pool.high_water] - seen.to(torch.int32)
+
+    def _average(self, rows: Tensor, points: Tensor, embeddings: Tensor) -> None:
+        """f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the m that are given to an instance.
+
+        Args:
+            rows: (m,) row of the instance that each is given to, -1 for none.
+            points: (m,) N_m.
+            embeddings: (m, d) f_m.
+        """
         given = torch.nonzero(rows >= 0).squeeze(1)
         if not len(given):
             return
         owners, place, _ = self._kernels.distinct(rows[given])
         groups = self._kernels.count_pairs(place, given, len(owners), len(rows))
-        ends = torch.zeros(len(proposals.counts) + 1, dtype=torch.int64, device=self._device)
-        ends[1:] = torch.cumsum(proposals.counts, 0)
-        points = ends.index_select(0, proposals.offsets).diff().index_select(0, groups.partners)
+        points = points.index_select(0, groups.partners)
         old = self._weight_of_row[owners]
         new = old + torch.segment_reduce(points.to(torch.float64), "sum", lengths=groups.offsets.diff())
         weights = (old.to(torch.float32), new.to(torch.float32))

@@ -23,6 +23,9 @@ def test_defaults_are_the_papers():
         "image.width": 640,
         "image.height": 480,
         "fusion.period_frames": 5,
+        "fusion.keep_most_evidence": True,
+        "map.association": "iou",
+        "map.merge_overlap": 0.0,
     }
     assert {key: flat[key] for key in paper} == paper
 
@@ -46,6 +49,10 @@ def test_every_field_is_described():
         ({"map.voxel_size_m": float("nan")}, "map.voxel_size_m"),
         ({"map.max_hypotheses": 0}, "map.max_hypotheses"),
         ({"map.dtype": "int3"}, "map.dtype"),
+        ({"map.association": "visible"}, "map.association"),
+        ({"map.merge_overlap": 1.01}, "map.merge_overlap"),
+        ({"map.merge_cosine": -1.5}, "map.merge_cosine"),
+        ({"fusion.keep_most_evidence": "perhaps"}, "fusion.keep_most_evidence"),
         ({"input.T_body_camera": [0.0, 1.0]}, "input.T_body_camera"),
         ({"map": 3}, "map"),
     ],

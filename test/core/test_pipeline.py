@@ -102,6 +102,60 @@ def test_a_window_bounds_the_dense_layer_and_keeps_instances():
     assert ask(pipeline, "red", "fused_instances").instances[0].centroid_m == pytest.approx([-0.4, 0.0, 2.0], abs=0.06)
 
 
+def test_what_a_keyframe_sees_outside_of_masks_is_visible_to_association():
+    # While the rest of the bar is in view, a mask of its end alone is something else.
+    assert instances_of_a_bar("iou", in_view=True) == instances_of_a_bar("visible_iou", in_view=True) == 2
+    # Where only the end is seen, it is all that there is to compare with.
+    assert instances_of_a_bar("iou", in_view=False) == 2
+    assert instances_of_a_bar("visible_iou", in_view=False) == 1
+
+
+def instances_of_a_bar(association: str, in_view: bool) -> int:
+    """Instances after a frame with a mask over a whole bar and one with a mask over its left tenth.
+
+    Without ``in_view`` the second frame has no depth right of that mask.
+    """
+    bar = np.zeros((480, 640), bool)
+    bar[200:280, 40:600] = True
+    end = bar.copy()
+    end[:, 96:] = False
+
+    class Scripted:
+        def __init__(self) -> None:
+            self.masks = [bar, end]
+
+        def segment(self, rgb: np.ndarray, depth_m: np.ndarray) -> Masks:
+            return Masks.from_masks(self.masks.pop(0)[None])
+
+    pipeline = Pipeline(Config.from_flat({"map.association": association}), color_trio(), Scripted())
+    first, second = wall_frame(0), wall_frame(1, x_m=0.2)
+    depth_m = second.depth_m.copy()
+    if not in_view:
+        depth_m[:, 96:] = 0.0
+    assert pipeline.process(first).proposals == pipeline.process(replace(second, depth_m=depth_m)).proposals == 1
+    return pipeline.semantic_map.instance_count
+
+
+def test_a_window_that_keeps_no_evidence_is_the_configurations_choice():
+    evidence = {}
+    for keep in (True, False):
+        pipeline = make(fusion__window_radius_m=2.2, fusion__period_frames=1, fusion__keep_most_evidence=keep)
+        for i in range(20):
+            pipeline.process(wall_frame(i, x_m=0.2 * i))
+        copy = pipeline.empty_map()
+        copy.import_state(pipeline.semantic_map.export_state())
+        for semantic_map in (pipeline.semantic_map, copy):
+            semantic_map.prune_window(np.array([1e3, 0.0, 0.0]))
+            semantic_map.fuse()
+        state = pipeline.semantic_map.export_state()
+        evidence[keep] = state["fused_evidence"]
+        assert np.array_equal(evidence[keep], copy.export_state()["fused_evidence"])
+        alone = np.isclose(state["fused_embedding"], state["instance_embedding"], atol=1e-6).all(axis=1)
+        assert alone.all() != keep
+    assert (evidence[False] <= evidence[True]).all()
+    assert evidence[False].sum() < evidence[True].sum()
+
+
 MIB, BUDGET_MIB = 2**20, 1.7
 FEW = {"sampling__dense_per_patch": 1, "sampling__instance_per_patch": 1, "map__dtype": "float32"}
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import tracemalloc
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from torch.profiler import ProfilerActivity, profile
 
 from fus3dmaps_core.config import MapConfig
 from fus3dmaps_core.kernels.torch_kernels import TorchKernels
+from fus3dmaps_core.labels import label_voxels
 from fus3dmaps_core.layers.similarity import LAYERS
 from fus3dmaps_core.query import TextQuery, answer_query
 from fus3dmaps_core.semantic_map import SemanticMap
@@ -60,6 +63,22 @@ def peak_bytes(events) -> int:
     return max(0, *itertools.accumulate(nbytes for _, nbytes in changes))
 
 
+def peaks_bytes(semantic_map: SemanticMap, ask: Callable[[], Any]) -> tuple[Any, int, int]:
+    """What a call returns, and the most that it allocates at once in arrays and in tensors, the kept ones included."""
+    activities = (
+        [ProfilerActivity.CPU, ProfilerActivity.CUDA] if semantic_map.config.device != "cpu" else [ProfilerActivity.CPU]
+    )
+    with profile(activities=activities, profile_memory=True) as profiled:
+        tracemalloc.start()
+        answer = ask()
+        of_arrays = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    of_tensors = peak_bytes(profiled.profiler.kineto_results.events())
+    assert of_tensors > 0
+    scratch = getattr(semantic_map._kernels, "scratch_nbytes", 0)  # Kept from call to call.
+    return answer, of_arrays, of_tensors + scratch
+
+
 @pytest.mark.parametrize("layer", LAYERS)
 @pytest.mark.parametrize(("prompts", "negatives"), [(3, 0), (1, 2), (200, 0), (200, 50)])
 def test_a_query_needs_little_beside_its_answer(large_map: SemanticMap, layer: str, prompts: int, negatives: int):
@@ -70,18 +89,25 @@ def test_a_query_needs_little_beside_its_answer(large_map: SemanticMap, layer: s
     answer_query(large_map, TEXTS, query, 10.0)  # Whatever is made once is there then.
     # One voxel of each row: fusion of every instance is to be computed anew.
     see(large_map, np.concatenate([slice_points_m(x)[::LENGTH] for x in range(SLICES)]), np.random.default_rng(2))
-    activities = (
-        [ProfilerActivity.CPU, ProfilerActivity.CUDA] if large_map.config.device != "cpu" else [ProfilerActivity.CPU]
-    )
-    with profile(activities=activities, profile_memory=True) as profiled:
-        tracemalloc.start()
-        answer = answer_query(large_map, TEXTS, query, 10.0)
-        of_arrays = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-    of_tensors = peak_bytes(profiled.profiler.kineto_results.events())
-    assert of_tensors > 0
+    answer, of_arrays, of_tensors = peaks_bytes(large_map, lambda: answer_query(large_map, TEXTS, query, 10.0))
     # The answer is as large as the map at first: only what is written becomes real.
     full_answer = large_map.voxel_count * (3 + 1) * 4
     assert of_arrays >= answer.points_m.nbytes
-    scratch = getattr(large_map._kernels, "scratch_nbytes", 0)  # Kept from call to call.
-    assert of_arrays - full_answer + of_tensors + scratch < 48 * MIB
+    assert of_arrays - full_answer + of_tensors < 48 * MIB
+
+
+@pytest.mark.parametrize("layer", LAYERS)
+@pytest.mark.parametrize("labels", [3, 250])
+def test_labels_of_a_map_need_little_beside_them(large_map: SemanticMap, layer: str, labels: int):
+    """However many labels; there are more of them than sums of 6,000 instances are kept for at a time."""
+    if labels == 250 and layer == "fused_dense" and isinstance(large_map._kernels, TorchKernels):
+        labels = 100  # Slow in torch, and no different.
+    names = [str(number) for number in range(labels)]
+    vectors = np.random.default_rng(4).normal(size=(labels, DIMENSION))
+    texts = KnownTexts(dict(zip(names, vectors, strict=True)))
+    label_voxels(large_map, texts, names, layer)  # Whatever is made once is there then.
+    see(large_map, np.concatenate([slice_points_m(x)[::LENGTH] for x in range(SLICES)]), np.random.default_rng(2))
+    found, of_arrays, of_tensors = peaks_bytes(large_map, lambda: label_voxels(large_map, texts, names, layer))
+    full_answer = large_map.voxel_count * (3 + 1 + 1) * 4
+    assert of_arrays >= found.points_m.nbytes + found.labels.nbytes + found.scores.nbytes
+    assert of_arrays - full_answer + of_tensors < 48 * MIB

@@ -42,12 +42,22 @@ def interface_manifest(root: Path) -> Package:
 @pytest.fixture(scope="session")
 def pins(root: Path) -> dict[str, str]:
     """Release by canonical name, from constraints.txt."""
+    return read_pins(root / "constraints.txt")
+
+
+@pytest.fixture(scope="session")
+def pins_of_models(root: Path) -> dict[str, str]:
+    """Release by canonical name, from constraints-models.txt."""
+    return read_pins(root / "constraints-models.txt")
+
+
+def read_pins(path: Path) -> dict[str, str]:
     found: dict[str, str] = {}
-    for line in (root / "constraints.txt").read_text().splitlines():
+    for line in path.read_text().splitlines():
         if line.startswith("#"):
             continue
         pin = re.fullmatch(r"([a-z0-9.-]+)==([0-9][0-9a-z.]*)", line)
-        assert pin, f"constraints.txt: {line!r} pins no single release"
-        assert canonicalize_name(pin[1]) not in found, f"constraints.txt: {pin[1]} twice"
+        assert pin, f"{path.name}: {line!r} pins no single release"
+        assert canonicalize_name(pin[1]) not in found, f"{path.name}: {pin[1]} twice"
         found[canonicalize_name(pin[1])] = pin[2]
     return found

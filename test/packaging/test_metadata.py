@@ -33,7 +33,8 @@ def imported_modules(folder: Path) -> dict[str, Path]:
 
 
 def declared_distributions(distribution) -> set[str]:
-    lines = distribution.install_requires + distribution.extras_require["lite"]
+    extras = [line for extra in ("lite", "evaluation", "models") for line in distribution.extras_require[extra]]
+    lines = distribution.install_requires + extras
     return {canonicalize_name(Requirement(line).name) for line in lines}
 
 

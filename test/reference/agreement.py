@@ -38,8 +38,13 @@ def engine_of(setting: Setting) -> SemanticMap:
         dtype=setting.dtype,
         backend=setting.backend,
         device=setting.device,
+        association=setting.association,
+        merge_overlap=setting.merge_overlap,
+        merge_cosine=setting.merge_cosine,
     )
-    return SemanticMap(setting.dimension, config, setting.variance_ratio, setting.window_radius_m)
+    return SemanticMap(
+        setting.dimension, config, setting.variance_ratio, setting.window_radius_m, setting.keep_most_evidence
+    )
 
 
 def reference_of(setting: Setting) -> ReferenceMap:
@@ -50,6 +55,10 @@ def reference_of(setting: Setting) -> ReferenceMap:
         setting.iou_threshold,
         setting.variance_ratio,
         setting.window_radius_m,
+        setting.keep_most_evidence,
+        setting.association,
+        setting.merge_overlap,
+        setting.merge_cosine,
     )
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from reference.vectors import Key, Vector, center_of, unit, voxel_of
+from reference.vectors import Key, Vector, center_of, cosine, unit, voxel_of
 
 
 @dataclass
@@ -44,6 +44,10 @@ class ReferenceMap:
     iou_threshold: float
     variance_ratio: float
     window_radius_m: float = 0.0
+    keep_most_evidence: bool = True
+    association: str = "iou"
+    merge_overlap: float = 0.0
+    merge_cosine: float = 0.8
     next_id: int = 0
     voxels: set[Key] = field(default_factory=set)
     color: dict[Key, Vector] = field(default_factory=dict)
@@ -98,9 +102,12 @@ class ReferenceMap:
         counts = self.hypotheses.get(key, {})
         return min(counts, key=lambda each: (-counts[each], each)) if counts else None
 
-    def integrate_proposals(self, points_m, proposals, embeddings) -> list[int]:
+    def integrate_proposals(self, points_m, proposals, embeddings, visible_points_m=None) -> list[int]:
         """One keyframe's proposals in row order; the id each was given, -1 for one without points."""
         ids = []
+        hit = {voxel_of(point, self.voxel_size_m) for point in points_m}
+        seen = () if visible_points_m is None else visible_points_m
+        visible = hit | {voxel_of(point, self.voxel_size_m) for point in seen}
         for m, embedding in enumerate(embeddings):
             hits: Counter[Key] = Counter()
             for point, proposal in zip(points_m, proposals, strict=True):
@@ -110,12 +117,55 @@ class ReferenceMap:
                 self.seen["proposal_without_point"] += 1
                 ids.append(-1)
                 continue
-            ids.append(self._integrate_proposal(hits, unit(embedding)))
+            ids.append(self._integrate_proposal(hits, unit(embedding), visible))
+        if self.merge_overlap > 0:
+            while pairs := self._overlapping_pairs(hit):
+                gone: set[int] = set()
+                grown: set[int] = set()
+                for a, b in pairs:
+                    if not gone & {a, b} and b not in grown:
+                        gone.add(b)
+                        self.seen["merge_of_several"] += a in grown
+                        grown.add(a)
+                        self._merge(a, b)
+                        ids = [a if each == b else each for each in ids]
+                self.seen["merge_pass"] += 1
         return ids
 
-    def _integrate_proposal(self, hits: Counter[Key], embedding: Vector) -> int:
+    def _overlapping_pairs(self, keys: set[Key]) -> list[tuple[int, int]]:
+        """Pairs a < b of instances that meet in one of the voxels and are to become one, in order."""
+        meeting = {
+            (a, b) for key in keys for a in self.hypotheses.get(key, {}) for b in self.hypotheses.get(key, {}) if a < b
+        }
+        found = []
+        for a, b in sorted(meeting):
+            of_a, of_b = self.voxels_of(a), self.voxels_of(b)
+            if len(of_a & of_b) / min(len(of_a), len(of_b)) < self.merge_overlap:
+                self.seen["merge_overlap_too_small"] += 1
+            elif cosine(self.instances[a].embedding, self.instances[b].embedding) < self.merge_cosine:
+                self.seen["merge_unlike"] += 1
+            else:
+                found.append((a, b))
+        return found
+
+    def _merge(self, a: int, b: int) -> None:
+        """Let a take in b."""
+        one, other = self.instances[a], self.instances.pop(b)
+        total = one.weight + other.weight
+        one.embedding = (one.weight * one.embedding + other.weight * other.embedding) / total
+        one.weight = total
+        if other.evidence > one.evidence:
+            self.seen["merge_of_stored"] += 1
+            one.fused_embedding, one.evidence = other.fused_embedding, other.evidence
+        for counts in self.hypotheses.values():
+            if b in counts:
+                self.seen["merge_shared_voxel" if a in counts else "merge_renamed_voxel"] += 1
+                counts[a] = counts.get(a, 0) + counts.pop(b)
+        self.seen["instance_merged"] += 1
+
+    def _integrate_proposal(self, hits: Counter[Key], embedding: Vector, visible: set[Key]) -> int:
         points = sum(hits.values())
-        instance_id = self._associate(set(hits))
+        instance_id = self._associate(set(hits), visible)
         if instance_id is None:
             self.seen["instance_new"] += 1
             instance_id = self.next_id
@@ -145,11 +195,14 @@ class ReferenceMap:
             self.seen[branch] += 1
             del self.instances[other]
 
-    def _associate(self, voxels: set[Key]) -> int | None:
+    def _associate(self, voxels: set[Key], visible: set[Key]) -> int | None:
         overlap: dict[int, float] = {}
         for instance_id in sorted({each for key in voxels for each in self.hypotheses.get(key, {})}):
             members = self.voxels_of(instance_id)
-            overlap[instance_id] = len(voxels & members) / len(voxels | members)
+            counted = members & visible if self.association == "visible_iou" else members
+            if len(counted) < len(members):
+                self.seen["match_of_visible"] += 1
+            overlap[instance_id] = len(voxels & members) / len(voxels | counted)
         if not overlap:
             return None
         best = max(overlap.values())
@@ -187,14 +240,15 @@ class ReferenceMap:
         return (weight * self.dense_mean[key] + support * self.instances[top].embedding) / (weight + support)
 
     def fuse(self, full: bool = False) -> Fusion:
-        """Store fusion of every instance; with a window only where evidence grew."""
+        """Store fusion of every instance; with a window that keeps the most evidence only where it grew."""
         updated = 0
         for instance_id, instance in self.instances.items():
             fused, evidence = self.fused_instance(instance_id)
-            if self.window_radius_m > 0 and not evidence > instance.evidence:
+            if self.window_radius_m > 0 and self.keep_most_evidence and not evidence > instance.evidence:
                 self.seen["fusion_kept"] += 1
                 continue
             self.seen["fusion_replaced"] += 1
+            self.seen["fusion_replaced_by_less"] += evidence < instance.evidence
             instance.fused_embedding, instance.evidence = fused, evidence
             updated += 1
         return Fusion(updated, len(self.instances) if full else None)

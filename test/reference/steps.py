@@ -25,6 +25,10 @@ class Setting:
     iou_threshold: float = 0.2
     variance_ratio: float = 1.0
     window_radius_m: float = 0.0
+    keep_most_evidence: bool = True
+    association: str = "iou"
+    merge_overlap: float = 0.0
+    merge_cosine: float = 0.8
     dimension: int = 5
     dtype: str = "float32"
     backend: str = "auto"
@@ -52,9 +56,10 @@ class ProposalStep:
     points_m: np.ndarray
     proposals: np.ndarray
     embeddings: np.ndarray
+    visible_points_m: np.ndarray | None = None
 
     def apply(self, target: Any) -> Any:
-        return target.integrate_proposals(self.points_m, self.proposals, self.embeddings)
+        return target.integrate_proposals(self.points_m, self.proposals, self.embeddings, self.visible_points_m)
 
 
 @dataclass(frozen=True)
@@ -146,15 +151,23 @@ def dense_step(keys: list[Key], setting: Setting, rng: np.random.Generator, weig
 
 
 def proposal_step(masks: list[list[Key]], setting: Setting, rng: np.random.Generator) -> ProposalStep:
-    """A frame of proposals, each with a point in each of its voxels, which may repeat; points come in mixed order."""
+    """A frame of proposals, each with a point in each of its voxels, which may repeat; points come in mixed order.
+
+    Where association asks what is visible, some voxels around are, with or without those of the proposals.
+    """
     keys = [key for mask in masks for key in mask]
     proposals = np.array([m for m, mask in enumerate(masks) for _ in mask], dtype=np.int64)
     order = rng.permutation(len(keys))
-    return ProposalStep(
+    step = ProposalStep(
         points_in(np.array(keys).reshape(-1, 3), setting.voxel_size_m, rng)[order],
         proposals[order],
         embeddings_of(len(masks), setting.dimension, rng),
     )
+    if setting.association == "iou" or rng.random() < 0.2:
+        return step
+    some = np.array(keys).reshape(-1, 3)[:: rng.integers(1, 4)]
+    around = np.concatenate([rng.integers(-3, 3, (int(rng.integers(0, 40)), 3)), some])
+    return replace(step, visible_points_m=points_in(around, setting.voxel_size_m, rng))
 
 
 def remove_step(keys: list[Key], setting: Setting, rng: np.random.Generator) -> RemoveStep:

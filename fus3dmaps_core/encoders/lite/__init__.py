@@ -11,8 +11,7 @@ Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.we
 
 from __future__ import annotations
 
-import torch
-
+from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
 from fus3dmaps_core.encoders.lite.detector import shared_detector
 from fus3dmaps_core.encoders.lite.network import load_classifier
@@ -29,17 +28,20 @@ _VARIANCE_RATIO = 1.0
 _LOGIT_SCALE = 20.0
 
 
-def load_trio(device: str, crop_padding: float) -> EncoderTrio:
+def load_trio(device: str, crop_padding: float, weights: str) -> EncoderTrio:
     """Load the three encoders.
 
     Args:
         device: Torch device, e.g. ``cpu`` or ``cuda:0``. The detector runs on the CPU in any case.
         crop_padding: Padding around a mask's box, as a share of its size.
+        weights: Must be empty.
 
     Raises:
-        EncoderError: The device cannot be used, or a package or its weights are missing or altered.
+        EncoderError: The device cannot be used, other weights are asked for, or a package or its weights are missing or
+            altered.
     """
-    _check_device(device)
+    check_device(device)
+    _check_no_weights(weights)
     detector, network = shared_detector(), load_classifier(device)
     model = SentenceModel(device)
     vocabulary = load_vocabulary(model)
@@ -55,19 +57,20 @@ def load_trio(device: str, crop_padding: float) -> EncoderTrio:
     )
 
 
-def load_text_encoder(device: str) -> TextEncoder:
+def load_text_encoder(device: str, weights: str) -> TextEncoder:
     """Load the text encoder alone.
 
     Raises:
         EncoderError: As :func:`load_trio`.
     """
-    _check_device(device)
+    check_device(device)
+    _check_no_weights(weights)
     model = SentenceModel(device)
     return LiteTextEncoder(model, load_vocabulary(model))
 
 
-def _check_device(device: str) -> None:
-    try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # Torch asserts where it was built without CUDA.
-        raise EncoderError(f"parameter 'encoder.device': torch cannot use '{device}': {error}") from None
+def _check_no_weights(weights: str) -> None:
+    if weights:
+        raise EncoderError(
+            f"parameter 'encoder.weights': encoder 'lite' has no weights but those of its pip packages, got '{weights}'"
+        )

@@ -131,23 +131,25 @@ def score(embedding: np.ndarray, texts: np.ndarray, prompts: int, logit_scale: f
 
 
 def scan_all(kernels, given_scene: Scene, layer, parts: int, prompts: int, threshold: float):
-    """Scan a scene in some blocks: how many have the layer, centres, best scores, extents and sums."""
+    """Scan a scene in some blocks: how many have the layer, centres, best scores and whose they are, extents and sums."""
     device, count = given_scene.device, len(given_scene.alive)
     keys = torch.where(torch.tensor(given_scene.alive), pack(torch.tensor(given_scene.coordinates)), EMPTY).to(device)
     extents = no_extents(device)
     zeros = partial(torch.zeros, dtype=torch.int64, device=device)
     sums = None if layer is None else ScoreSums(zeros(len(ID_OF_ROW)), zeros((len(ID_OF_ROW), prompts)))
-    found, centers, best = 0, [], []
+    found, centers, best, which = 0, [], [], []
     for part in np.array_split(np.arange(count), parts):
         first, end = (int(part[0]), int(part[-1]) + 1) if len(part) else (0, 0)
         rows = torch.tensor(given_scene.dense_rows[first:end].astype(np.int32), device=device)
         block = SlotBlock(first=first, keys=keys[first:end], dense_rows=rows, voxel_size_m=SIZE_M)
-        room = ScoredVoxels(torch.empty((len(rows), 3), device=device), torch.empty(len(rows), device=device))
+        empty = partial(torch.empty, device=device)
+        room = ScoredVoxels(empty((len(rows), 3)), empty(len(rows)), empty(len(rows), dtype=torch.int32))
         have, kept = kernels.scan(block, given_scene.hypotheses, extents, layer, sums, threshold, room)
         found += have
         centers.append(room.centers_m[:kept].cpu().numpy())
         best.append(room.best[:kept].cpu().numpy())
-    return found, np.concatenate(centers), np.concatenate(best), extents, sums
+        which.append(room.which[:kept].cpu().numpy())
+    return found, np.concatenate(centers), np.concatenate(best), np.concatenate(which), extents, sums
 
 
 def layer_of(kind: str, given_scene: Scene, texts: Texts, scores_of_row: np.ndarray, ratio: float):
@@ -195,7 +197,7 @@ def test_a_scan_says_what_plain_loops_say(backend, kind: str, dtype: str):
         texts = Texts(torch.tensor(vectors, device=device), prompts, 3.0)
         scores_of_row = rng.uniform(-1, 1, (len(ID_OF_ROW), prompts)).astype(np.float32)
         layer = layer_of(kind, given_scene, texts, scores_of_row, ratio)
-        found, centers, best, extents, sums = scan_all(kernels, given_scene, layer, parts, prompts, threshold)
+        found, centers, best, which, extents, sums = scan_all(kernels, given_scene, layer, parts, prompts, threshold)
 
         check_extents(extents, given_scene)
         tops = given_scene.tops()
@@ -218,6 +220,8 @@ def test_a_scan_says_what_plain_loops_say(backend, kind: str, dtype: str):
             exact = [(given_scene.coordinates[slot] + 0.5) * SIZE_M for slot in kept]
             np.testing.assert_array_equal(centers, np.array(exact, np.float32).reshape(-1, 3))
             np.testing.assert_allclose(best, [highest[slot] for slot in kept], atol=atol)
+            chosen = [expected[slot][prompt] for slot, prompt in zip(kept, which.tolist(), strict=True)]
+            np.testing.assert_allclose(chosen, [highest[slot] for slot in kept], atol=2 * atol)
         if sums is None:
             return
         for row in range(len(ID_OF_ROW)):
@@ -243,8 +247,8 @@ def test_scans_do_not_depend_on_the_number_of_threads_nor_compiled_ones_on_block
     try:
         for threads, parts in ways:
             torch.set_num_threads(threads)
-            found, centers, best, extents, sums = scan_all(kernels, given_scene, layer, parts, 2, 0.3)
-            arrays = [centers, best, *(each.cpu().numpy() for each in vars(extents).values())]
+            found, centers, best, which, extents, sums = scan_all(kernels, given_scene, layer, parts, 2, 0.3)
+            arrays = [centers, best, which, *(each.cpu().numpy() for each in vars(extents).values())]
             arrays += [] if sums is None else [sums.members.cpu().numpy(), sums.totals.cpu().numpy()]
             results.append((found, [each.tobytes() for each in arrays]))
     finally:
@@ -253,6 +257,29 @@ def test_scans_do_not_depend_on_the_number_of_threads_nor_compiled_ones_on_block
     if kind != "nothing":
         assert 0 < len(centers) < found
     check_extents(extents, given_scene)
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_of_equal_scores_the_first_prompt_has_the_best(backend, asked: bool):
+    kernels, device = backend
+    given_scene = scene(np.random.default_rng(7), 200, 4, "float32", device)
+    scores_of_row = np.array([[0, 1, 1], [9, 9, 9], [2, 2, 0], [0, 0, 0], [-3, -4, -3]], np.float32) / 10
+    layer = layer_of("inherited", given_scene, Texts(torch.ones((3, 4), device=device), 3, 1.0), scores_of_row, 1.0)
+    if asked:
+        _, _, best, which, _, _ = scan_all(kernels, given_scene, layer, 2, 3, -math.inf)
+        tops = [row for row, _ in given_scene.tops() if row >= 0]
+        assert set(tops) == set(ALIVE)
+        assert which.tolist() == [{0: 1, 2: 0, 3: 0, 4: 0}[row] for row in tops]
+        assert best.tolist() == [float(scores_of_row[row].max()) for row in tops]
+        return
+    zeros = partial(torch.zeros, dtype=torch.int64, device=device)
+    keys = torch.where(torch.tensor(given_scene.alive), pack(torch.tensor(given_scene.coordinates)), EMPTY).to(device)
+    block = SlotBlock(0, keys, torch.full((200,), -1, dtype=torch.int32, device=device), SIZE_M)
+    room = ScoredVoxels(torch.empty((200, 3), device=device), torch.empty(200, device=device))
+    sums = ScoreSums(zeros(len(ID_OF_ROW)), zeros((len(ID_OF_ROW), 3)))
+    found, kept = kernels.scan(block, given_scene.hypotheses, no_extents(device), layer, sums, -math.inf, room)
+    assert found == kept == sum(row >= 0 for row, _ in given_scene.tops())
+    assert room.which is None
 
 
 def test_opposites_that_cancel_out_keep_their_direction(backend):
@@ -276,7 +303,7 @@ def test_opposites_that_cancel_out_keep_their_direction(backend):
         for number, expected in ((0, 1.0 if rest else 0.0), (1, 0.0)):
             one = Texts(texts.vectors[number : number + 1], 1, 1.0)
             layer = layer_of("fused", given_scene, one, np.zeros((5, 1), np.float32), 1.0)
-            _, _, best, _, _ = scan_all(kernels, given_scene, layer, 1, 1, -math.inf)
+            _, _, best, _, _, _ = scan_all(kernels, given_scene, layer, 1, 1, -math.inf)
             np.testing.assert_allclose(best, [expected], atol=1e-4)
 
 

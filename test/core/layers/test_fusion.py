@@ -21,9 +21,14 @@ def a_map(request) -> Callable[..., SemanticMap]:
     """Makes a map on each of the backends."""
     backend, device = request.param
 
-    def make(variance_ratio: float = 1.0, window_radius_m: float = 0.0, max_hypotheses: int = 3) -> SemanticMap:
+    def make(
+        variance_ratio: float = 1.0,
+        window_radius_m: float = 0.0,
+        max_hypotheses: int = 3,
+        keep_most_evidence: bool = True,
+    ) -> SemanticMap:
         config = MapConfig(voxel_size_m=SIZE_M, max_hypotheses=max_hypotheses, backend=backend, device=device)
-        return SemanticMap(3, config, variance_ratio, window_radius_m)
+        return SemanticMap(3, config, variance_ratio, window_radius_m, keep_most_evidence)
 
     return make
 
@@ -155,6 +160,28 @@ def test_with_a_window_only_more_evidence_replaces(a_map):
     embedding, evidence = fused(semantic_map)
     np.testing.assert_allclose(embedding, (X + 3.25 * Z) / 4.25, atol=1e-6)
     assert evidence == 4.25
+
+
+def test_a_window_that_keeps_no_evidence_replaces_by_what_is_left(a_map):
+    semantic_map = a_map(window_radius_m=2.0, keep_most_evidence=False)
+    see(semantic_map, [0, 1], X, weight=3.0)
+    assert propose(semantic_map, [0, 1], Y) == 0
+    see(semantic_map, [50], X)
+    assert propose(semantic_map, [50], X) == 1
+    assert semantic_map.fuse().updated == 2
+    np.testing.assert_allclose(fused(semantic_map)[0], (3 * X + Y) / 4, atol=1e-6)
+    assert fused(semantic_map)[1] == 8.0
+    assert semantic_map.prune_window(points([0, 51])[1]) == 2
+    # Nothing of instance 0 is left in the window: it has its own embedding, in what is stored and in answers.
+    report = semantic_map.fuse()
+    assert (report.updated, report.recomputed) == (2, 1)
+    np.testing.assert_allclose(fused(semantic_map)[0], Y, atol=1e-6)
+    assert fused(semantic_map)[1] == 2.0
+    np.testing.assert_allclose(cosines(semantic_map, "fused_instances")[0], Y, atol=1e-6)
+    # It was seen again, but from where less of it is: what is stored follows.
+    see(semantic_map, [0], Z)
+    semantic_map.fuse()
+    np.testing.assert_allclose(fused(semantic_map)[0], (Z + 2 * Y) / 3, atol=1e-6)
 
 
 def test_without_a_window_less_evidence_replaces_too(a_map):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from functools import partial
 
 import cv2
 import numpy as np
@@ -152,6 +153,14 @@ def test_two_threads_get_what_one_gets(trio):
         for (crop, text), (expected_crop, expected_text) in zip(found[worker], expected, strict=True):
             np.testing.assert_allclose(crop, expected_crop, atol=1e-6)
             np.testing.assert_allclose(text, expected_text, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "load", [lambda weights: load_trio("lite", "cpu", 0.05, weights), partial(load_text_encoder, "lite", "cpu")]
+)
+def test_weights_of_ones_own_are_refused_by_name(load):
+    with pytest.raises(EncoderError, match=r"encoder\.weights.*'lite'.*'mine\.pt'"):
+        load("mine.pt")
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "abacus"])

@@ -1,0 +1,30 @@
+"""Packages of the extra ``models``, imported only by who loads an encoder that needs them."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+
+from fus3dmaps_core.errors import EncoderError
+
+EXTRA = "fus3dmaps[models]"
+
+
+def import_optional(module: str, encoder: str) -> ModuleType:
+    """Import a module of a package that the base installation does not have.
+
+    Args:
+        module: Dotted name.
+        encoder: Who needs it, for the message.
+
+    Raises:
+        EncoderError: It is not installed, or not for this torch; the message names the extra that has it.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise EncoderError(
+            f"encoder '{encoder}' needs '{error.name or module}', which is not installed; use {EXTRA}"
+        ) from None
+    except (RuntimeError, OSError, AttributeError) as error:  # So torchvision fails beside another torch than its own.
+        raise EncoderError(f"encoder '{encoder}': cannot import '{module}' ({error}); install {EXTRA}") from None

@@ -1,0 +1,1 @@
+"""Encoder pairs on RADIO, NVIDIA's vision model with many teachers: ``naradio`` and ``radseg``."""

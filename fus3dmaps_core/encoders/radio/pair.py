@@ -1,0 +1,132 @@
+"""What the two pairs on RADIO have in common: which files they need, and how their three encoders are put together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
+from fus3dmaps_core.encoders.radio.adaptor import CropNetwork, PatchNetwork, SummaryHead, load_head
+from fus3dmaps_core.encoders.radio.backbone import DenseAttention, RadioBackbone
+from fus3dmaps_core.encoders.radio.checkout import find_checkout
+from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
+from fus3dmaps_core.encoders.radio.images import RadioCropEncoder, RadioPatchEncoder
+from fus3dmaps_core.encoders.radio.published import TextTower
+from fus3dmaps_core.encoders.radio.text import load_text
+from fus3dmaps_core.encoders.weights import WeightFile, find_weights
+from fus3dmaps_core.errors import EncoderError
+
+_LOGIT_SCALE = 100.0  # As the evaluations of these models do; SigLIP's own factor is of this size.
+
+
+@dataclass(frozen=True)
+class RadioPair:
+    """One pair.
+
+    Attributes:
+        name: Registry name.
+        radio: RADIO's checkpoint.
+        teacher: Name of the teacher of its vision-language space in the checkpoint.
+        text: The teacher's text tower.
+        dimension: Embedding width d.
+        attention: Makes the attention of the last block for patches.
+        variance_ratio: lambda.
+        crop_px: Edge of the square that a crop is brought to, a multiple of the patches' edge.
+    """
+
+    name: str
+    radio: WeightFile
+    teacher: str
+    text: TextTower
+    dimension: int
+    attention: DenseAttention
+    variance_ratio: float
+    crop_px: int
+
+
+def load_trio(pair: RadioPair, device: str, crop_padding: float, weights: str) -> EncoderTrio:
+    """Load the three encoders of a pair.
+
+    Args:
+        pair: Which one.
+        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        crop_padding: Padding around a mask's box, as a share of its size.
+        weights: ``encoder.weights``: a directory with RADIO's checkpoint, the text tower's two files and, where it is not to
+            come from ``torch.hub``, the folder ``RADIO`` of its code; or RADIO's checkpoint alone, by path or repository; or
+            empty.
+
+    Raises:
+        EncoderError: The device cannot be used, or a package, code or weights are missing, damaged or others.
+    """
+    check_device(device)
+    backbone, head = load_networks(pair, weights)
+    dtype = default_dtype(device)
+    text = load_text(pair.text, weights, device, pair.name)
+    return make_trio(pair, backbone, head, text, device, crop_padding, dtype)
+
+
+def load_text_encoder(pair: RadioPair, device: str, weights: str) -> TextEncoder:
+    """Load the text encoder of a pair alone; nothing of RADIO is needed.
+
+    Raises:
+        EncoderError: As :func:`load_trio`.
+    """
+    check_device(device)
+    return load_text(pair.text, weights, device, pair.name)
+
+
+def load_networks(pair: RadioPair, weights: str) -> tuple[RadioBackbone, SummaryHead]:
+    """RADIO's transformer and the teacher's head with their weights, on the CPU in float32.
+
+    Raises:
+        EncoderError: As :func:`load_trio`.
+    """
+    checkout = find_checkout(weights, pair.name)
+    checkpoint = read_checkpoint(find_weights("encoder.weights", weights, pair.radio), checkout, pair.name)
+    head = load_head(checkpoint, pair.teacher, checkout, pair.name)
+    if head.dimension != pair.dimension:
+        raise EncoderError(
+            f"weights '{checkpoint.path}': its adaptor embeds in {head.dimension} dimensions, encoder '{pair.name}' in "
+            f"{pair.dimension}"
+        )
+    return RadioBackbone(checkpoint.radio, pair.attention), head
+
+
+def make_trio(
+    pair: RadioPair,
+    backbone: RadioBackbone,
+    head: SummaryHead,
+    text: TextEncoder,
+    device: str,
+    crop_padding: float,
+    dtype: torch.dtype = torch.float32,
+) -> EncoderTrio:
+    """The three encoders over given networks.
+
+    Args:
+        pair: Whose.
+        backbone: RADIO's transformer.
+        head: The teacher's head.
+        text: Text encoder of the teacher's space.
+        device: Torch device that the first two are moved to.
+        crop_padding: As in :func:`load_trio`.
+        dtype: Precision of transformer and head; embeddings are normalised and handed out in float32.
+    """
+    patches = PatchNetwork(backbone, head).eval().to(device, dtype)
+    crops = CropNetwork(backbone, head).eval().to(device, dtype)
+    return EncoderTrio(
+        name=pair.name,
+        dimension=head.dimension,
+        variance_ratio=pair.variance_ratio,
+        logit_scale=_LOGIT_SCALE,
+        patch=RadioPatchEncoder(patches, device, dtype),
+        crop=RadioCropEncoder(crops, pair.crop_px, crop_padding, device, dtype),
+        text=text,
+    )
+
+
+def default_dtype(device: str) -> torch.dtype:
+    """bfloat16 on CUDA, as RADIO's authors run it, and float32 elsewhere, where it is the faster one."""
+    return torch.bfloat16 if torch.device(device).type == "cuda" else torch.float32

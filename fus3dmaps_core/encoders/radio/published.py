@@ -1,0 +1,95 @@
+"""Which code and weights the RADIO pairs need, where they are published, and under which licences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from fus3dmaps_core.encoders.weights import WeightFile
+
+REPOSITORY = "NVlabs/RADIO"
+REVISION = "c0f37017930e9dda53f93424cf4bf39fc51f287e"
+CODE_LICENCE = "NVIDIA Source Code License for RADIO (research and evaluation only)"
+
+RADIO_LARGE = WeightFile(
+    title="RADIO v2.5-L",
+    file_name="radio-v2.5-l_half.pth.tar",
+    url="https://huggingface.co/nvidia/RADIO/resolve/main/radio-v2.5-l_half.pth.tar",
+    hub="nvidia/RADIO",
+    revision="main",
+    sha256="",
+    licence="NVIDIA Source Code License for RADIO (research and evaluation only)",
+)
+
+C_RADIO_BASE = WeightFile(
+    title="C-RADIO v3-B",
+    file_name="c-radio_v3-b_half.pth.tar",
+    url="https://huggingface.co/nvidia/C-RADIOv3-B/resolve/main/c-radio_v3-b_half.pth.tar",
+    hub="nvidia/C-RADIOv3-B",
+    revision="main",
+    sha256="",
+    licence="NVIDIA Open Model License",
+)
+
+
+@dataclass(frozen=True)
+class TextTower:
+    """A published text tower of SigLIP's kind.
+
+    Attributes:
+        weights: File of the whole model, as the package ``transformers`` names its weights.
+        tokenizer: Its tokenizer.
+        vocabulary: How many tokens it knows.
+        end_id: Token that ends a sentence.
+        pad_id: Token that fills the context, and that the embedding is read from.
+        dimension: Length of an embedding.
+        width: Length of a token inside.
+        hidden: Width inside the MLPs.
+        layers: How many blocks.
+        heads: Of attention.
+        context: Tokens of a sentence.
+    """
+
+    weights: WeightFile
+    tokenizer: WeightFile
+    vocabulary: int
+    end_id: int
+    pad_id: int
+    dimension: int = 1152
+    width: int = 1152
+    hidden: int = 4304
+    layers: int = 27
+    heads: int = 16
+    context: int = 64
+
+
+def _file(title: str, repository: str, name: str) -> WeightFile:
+    return WeightFile(
+        title=title,
+        file_name=name,
+        url=f"https://huggingface.co/{repository}/resolve/main/{name}",
+        hub=repository,
+        revision="main",
+        sha256="",
+        licence="Apache-2.0",
+    )
+
+
+_SIGLIP, _SIGLIP2 = "google/siglip-so400m-patch14-384", "google/siglip2-so400m-patch16-naflex"
+
+SIGLIP = TextTower(
+    weights=_file("SigLIP SO400M model", _SIGLIP, "model.safetensors"),
+    tokenizer=_file("SigLIP SO400M tokenizer", _SIGLIP, "tokenizer.json"),
+    vocabulary=32_000,
+    end_id=1,
+    pad_id=1,
+)
+"""The teacher of RADIO v2.5's adaptor ``siglip``."""
+
+SIGLIP2 = TextTower(
+    weights=_file("SigLIP 2 SO400M NaFlex model", _SIGLIP2, "model.safetensors"),
+    tokenizer=_file("SigLIP 2 SO400M NaFlex tokenizer", _SIGLIP2, "tokenizer.json"),
+    vocabulary=256_000,
+    end_id=1,
+    pad_id=0,
+)
+"""The teacher of C-RADIO v3-B's adaptor ``siglip2``; larger models' ``siglip2-g`` is another space, of 1536 dimensions."""

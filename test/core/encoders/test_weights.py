@@ -1,0 +1,278 @@
+"""Weight files: where they are looked for, what is refused and in which words, and that none of them runs code."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import hashlib
+import http.server
+import pickle
+import threading
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import save_file
+from torch import nn
+
+from fus3dmaps_core.encoders.weights import WeightFile, cache_directory, find_weights, fit, read_state
+from fus3dmaps_core.errors import EncoderError
+
+CONTENT = b"what the authors published"
+PUBLISHED = WeightFile(
+    title="Some model (v2)",
+    file_name="model.pt",
+    url="http://127.0.0.1:9/model.pt",  # A port that nobody listens on.
+    hub="",
+    revision="",
+    sha256=hashlib.sha256(CONTENT).hexdigest(),
+    licence="MIT",
+)
+
+
+@pytest.fixture(autouse=True)
+def own_caches(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
+    for name in ("http_proxy", "https_proxy", "all_proxy", "HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def server(tmp_path):
+    """Files of a folder at an address of this machine."""
+    folder = tmp_path / "published"
+    folder.mkdir()
+    handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as running:
+        thread = threading.Thread(target=running.serve_forever)
+        thread.start()
+        yield folder, f"http://127.0.0.1:{running.server_port}"
+        running.shutdown()
+        thread.join()
+
+
+def changed(**values: str) -> WeightFile:
+    return WeightFile(**{**vars(PUBLISHED), **values})
+
+
+def put_into_hub_cache(root: Path, repository: str, commit: str, name: str, content: bytes) -> None:
+    folder = root / "hub" / f"models--{repository.replace('/', '--')}"
+    (folder / "snapshots" / commit).mkdir(parents=True)
+    (folder / "snapshots" / commit / name).write_bytes(content)
+    (folder / "refs").mkdir()
+    (folder / "refs" / "main").write_text(commit)
+
+
+def test_a_path_is_the_file_or_the_directory_that_holds_it(tmp_path):
+    path = tmp_path / "model.pt"
+    path.write_bytes(CONTENT)
+    assert find_weights("encoder.weights", str(path), PUBLISHED) == path
+    assert find_weights("encoder.weights", str(tmp_path), PUBLISHED) == path
+
+
+def test_a_file_of_ones_own_under_another_name_is_not_held_to_the_hash(tmp_path):
+    path = tmp_path / "tuned.pt"
+    path.write_bytes(b"other")
+    assert find_weights("encoder.weights", str(path), PUBLISHED) == path
+
+
+@pytest.mark.parametrize("published", ["model.pt", "model.pth.tar"])
+def test_a_directory_may_hold_a_converted_file(tmp_path, published):
+    path = tmp_path / "model.safetensors"
+    path.write_bytes(b"converted")
+    assert find_weights("encoder.weights", str(tmp_path), changed(file_name=published)) == path
+
+
+def test_an_altered_file_is_refused_with_where_to_get_it(tmp_path):
+    (tmp_path / "model.pt").write_bytes(CONTENT[:-1])
+    with pytest.raises(EncoderError) as refusal:
+        find_weights("encoder.weights", str(tmp_path), PUBLISHED)
+    message = str(refusal.value)
+    for part in ("encoder.weights", str(tmp_path / "model.pt"), "sha256", PUBLISHED.sha256, PUBLISHED.url):
+        assert part in message
+    assert "\n" not in message
+
+
+def test_a_file_of_a_git_repository_is_held_to_its_name_there(tmp_path):
+    path = tmp_path / "model.pt"
+    path.write_bytes(b"hello\n")
+    file = changed(sha256="", git_blob="ce013625030ba8dba906f756967f9e9ca394464a")  # As `git hash-object` prints it.
+    assert find_weights("encoder.weights", str(path), file) == path
+    path.write_bytes(b"hallo\n")
+    with pytest.raises(EncoderError, match="its git blob is"):
+        find_weights("encoder.weights", str(path), file)
+
+
+@pytest.mark.parametrize(
+    "value", ["/no/such/model.pt", "models/model.pt", "model.safetensors", "./x", "~nobody_here/x", "x" * 5000]
+)
+def test_a_path_that_is_not_there_is_named(value):
+    with pytest.raises(EncoderError, match="no file or directory") as refusal:
+        find_weights("encoder.weights", value, PUBLISHED)
+    assert value in str(refusal.value)
+    assert PUBLISHED.url in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_directory_without_the_file_is_named(tmp_path):
+    with pytest.raises(EncoderError, match=r"has no 'model\.pt'.*download http"):
+        find_weights("encoder.weights", str(tmp_path), PUBLISHED)
+
+
+def test_without_a_value_the_own_cache_is_looked_at(tmp_path):
+    assert cache_directory() == tmp_path / "cache" / "fus3dmaps"
+    assert PUBLISHED.cached_path == tmp_path / "cache/fus3dmaps/some-model-v2/model.pt"
+    PUBLISHED.cached_path.parent.mkdir(parents=True)
+    PUBLISHED.cached_path.write_bytes(CONTENT)
+    assert find_weights("encoder.weights", "", PUBLISHED) == PUBLISHED.cached_path
+
+
+def test_without_a_value_the_hubs_cache_is_looked_at(tmp_path):
+    put_into_hub_cache(tmp_path, "some/model", "c" * 40, "model.pt", CONTENT)
+    on_hub = changed(hub="some/model", revision="c" * 40)
+    for value in ("", "some/model", f"some/model@{'c' * 40}"):
+        assert find_weights("encoder.weights", value, on_hub).read_bytes() == CONTENT
+
+
+def test_another_repository_is_not_held_to_the_hash(tmp_path):
+    put_into_hub_cache(tmp_path, "mine/model", "d" * 40, "model.pt", b"tuned")
+    for value in ("mine/model", "mine/model@main", f"mine/model@{'d' * 40}"):
+        assert find_weights("encoder.weights", value, changed(hub="some/model")).read_bytes() == b"tuned"
+
+
+def test_what_is_nowhere_and_cannot_be_fetched_says_what_to_do():
+    with pytest.raises(EncoderError, match="cannot be downloaded") as refusal:
+        find_weights("encoder.weights", "", changed(hub="some/model"))
+    message = str(refusal.value)
+    for part in ("encoder.weights", "Some model (v2)", "some/model", PUBLISHED.url, str(PUBLISHED.cached_path)):
+        assert part in message
+    assert "\n" not in message
+
+
+def test_what_may_be_a_directory_or_a_repository_is_said_to_be_neither():
+    with pytest.raises(EncoderError, match=r"'my/weights' is no directory here") as refusal:
+        find_weights("encoder.weights", "my/weights", PUBLISHED)
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_file_of_the_hub_alone_is_fetched_from_there():
+    with pytest.raises(EncoderError, match=r"download https://huggingface\.co/some/model/resolve/v2/model\.pt "):
+        find_weights("encoder.weights", "", changed(hub="some/model", revision="v2", url=""))
+
+
+def test_a_download_lands_in_the_cache_whole(server):
+    folder, address = server
+    (folder / "model.pt").write_bytes(CONTENT)
+    file = changed(url=f"{address}/model.pt")
+    assert find_weights("encoder.weights", "", file) == file.cached_path
+    assert file.cached_path.read_bytes() == CONTENT
+    assert list(file.cached_path.parent.iterdir()) == [file.cached_path]
+
+
+def test_a_download_that_is_not_there_leaves_nothing(server):
+    _, address = server
+    file = changed(url=f"{address}/model.pt")
+    with pytest.raises(EncoderError, match="404"):
+        find_weights("encoder.weights", "", file)
+    assert list(file.cached_path.parent.iterdir()) == []
+
+
+def test_a_download_of_something_else_is_refused(server):
+    folder, address = server
+    (folder / "model.pt").write_bytes(b"a page that asks to log in")
+    with pytest.raises(EncoderError, match="sha256"):
+        find_weights("encoder.weights", "", changed(url=f"{address}/model.pt"))
+
+
+def tensors() -> dict[str, torch.Tensor]:
+    return {"weight": torch.arange(6.0).reshape(2, 3), "bias": torch.ones(2)}
+
+
+@pytest.mark.parametrize(
+    "wrap",
+    [
+        lambda state: state,
+        lambda state: {"epoch": 3, "model_state_dict": state},
+        lambda state: {"state_dict": {f"module.{name}": value for name, value in state.items()}},
+        lambda state: {"args": argparse.Namespace(rate=0.1, name="a"), "state_dict": state},
+    ],
+)
+def test_tensors_come_back_from_what_torch_saves(tmp_path, wrap):
+    torch.save(wrap(tensors()), tmp_path / "a.pt")
+    state = read_state(tmp_path / "a.pt")
+    assert state.keys() == tensors().keys()
+    assert all(torch.equal(state[name], value) for name, value in tensors().items())
+
+
+def test_tensors_come_back_from_safetensors(tmp_path):
+    save_file(tensors(), tmp_path / "a.safetensors")
+    state = read_state(tmp_path / "a.safetensors")
+    assert all(torch.equal(state[name], value) for name, value in tensors().items())
+
+
+class Harmful:
+    """Creates a file when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+@pytest.mark.parametrize("save", [torch.save, lambda value, path: path.write_bytes(pickle.dumps(value, 2))])
+def test_a_file_with_code_in_it_is_refused_and_does_not_run(tmp_path, save):
+    save({"weight": torch.ones(1), "x": Harmful(tmp_path / "ran")}, tmp_path / "bad.pt")
+    with pytest.raises(EncoderError, match=r"bad\.pt'.*not loaded") as refusal:
+        read_state(tmp_path / "bad.pt")
+    assert "\n" not in str(refusal.value)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
+@pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda _: b"", lambda _: b"<html>log in</html>"])
+def test_a_damaged_file_is_refused_in_one_line(tmp_path, name, damage):
+    path = tmp_path / name
+    if path.suffix == ".pt":
+        torch.save({"weight": torch.ones(1000)}, path)
+    else:
+        save_file({"weight": torch.ones(1000)}, path)
+    path.write_bytes(damage(path.read_bytes()))
+    with pytest.raises(EncoderError, match="not a weight file") as refusal:
+        read_state(path)
+    assert str(path) in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("content", [[torch.ones(1)], {"epoch": 3}, {}, 3.0])
+def test_a_file_without_named_tensors_is_refused(tmp_path, content):
+    torch.save(content, tmp_path / "a.pt")
+    with pytest.raises(EncoderError, match=r"a\.pt'.*no named tensors"):
+        read_state(tmp_path / "a.pt")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(EncoderError, match=r"none\.pt"):
+        read_state(tmp_path / "none.pt")
+
+
+def test_weights_that_fit_are_copied():
+    module = nn.Linear(3, 2)
+    fit(module, tensors(), "weights 'a.pt'")
+    assert torch.equal(module.weight, tensors()["weight"])
+    assert torch.equal(module.bias, tensors()["bias"])
+
+
+def test_another_architecture_is_refused_by_the_names_that_differ():
+    module = nn.Linear(4, 2)
+    before = {name: value.clone() for name, value in module.state_dict().items()}
+    state = {"weight": torch.zeros(2, 3), **{f"extra{index}": torch.zeros(1) for index in range(9)}}
+    with pytest.raises(EncoderError) as refusal:
+        fit(module, state, "weights 'a.pt'")
+    message = str(refusal.value)
+    for part in ("weights 'a.pt'", "1 missing (bias)", "9 not expected (extra0, extra1, extra2, ...)", "(2, 3), not (2, 4)"):
+        assert part in message
+    assert "\n" not in message
+    assert all(torch.equal(module.state_dict()[name], value) for name, value in before.items())
