@@ -80,17 +80,5 @@ def list_maps(root: str | Path) -> list[str]:
     return [name for _, name in sorted(found)]
 
 
-def newest_map(root: str | Path) -> Path | None:
-    """Path of the map that was saved last, by the time in its manifest; None where there is none.
-
-    Only manifests are read: loading it may still find a damaged array, and :func:`list_maps` has the next in age.
-
-    Raises:
-        StorageError: The directory cannot be listed.
-    """
-    names = list_maps(root)
-    return map_path(root, names[0]) if names else None
-
-
 def _refused(name: str, cause: str) -> StorageError:
     return StorageError(f"{name[: 2 * MAX_NAME_BYTES]!r} cannot be the name of a map: {cause}")

@@ -36,7 +36,7 @@ class Autosave:
         self._read = read
         self._logger = logger
         self._wake = threading.Condition()
-        self._stopping = False
+        self._stopping = self._saving_last = False
         self._saved_revision = session.worker.revision
         self._succeeded = self._failed = 0
         # Daemon: a disk that hangs must not keep the process from ending. A save cut off leaves the last good map.
@@ -47,6 +47,11 @@ class Autosave:
         """Saves that succeeded and that failed."""
         return self._succeeded, self._failed
 
+    @property
+    def is_due(self) -> bool:
+        """Whether the map is saved by period and has changed since the last save that succeeded."""
+        return self._read().node.autosave_period_s > 0 and self._has_changed(self._session.worker.revision)
+
     def start(self) -> None:
         """Run the thread."""
         self._thread.start()
@@ -56,10 +61,20 @@ class Autosave:
         with self._wake:
             self._wake.notify()
 
-    def stop(self, timeout_s: float) -> bool:
-        """End the thread; whether it has ended in time: a save in work is waited for."""
+    def stop(self, timeout_s: float, save: bool = False) -> bool:
+        """End the thread, once a save in work is done.
+
+        Can be called again, to go on waiting; the last word on ``save`` counts.
+
+        Args:
+            timeout_s: How long to wait, seconds.
+            save: Whether the thread saves a last time before it ends, if that is due.
+
+        Returns:
+            Whether it has ended in time.
+        """
         with self._wake:
-            self._stopping = True
+            self._stopping, self._saving_last = True, save
             self._wake.notify()
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
@@ -68,7 +83,7 @@ class Autosave:
     def save_if_changed(self) -> None:
         """Save now, unless the map is empty or as it was at the last save that succeeded."""
         revision = self._session.worker.revision
-        if revision == self._saved_revision or self._session.pipeline.semantic_map.voxel_count == 0:
+        if not self._has_changed(revision):
             return
         try:
             root = self._read().node.map_directory
@@ -82,14 +97,19 @@ class Autosave:
         self._succeeded += 1
         self._logger.debug(f"saved '{path}', {size_bytes} bytes")
 
+    def _has_changed(self, revision: int) -> bool:
+        return revision != self._saved_revision and self._session.pipeline.semantic_map.voxel_count > 0
+
     def _run(self) -> None:
         while True:
             with self._wake:
                 # A notification is a stop or another period; either way the wait begins anew.
                 if self._stopping:
-                    return
+                    break
                 if self._wake.wait(self._read().node.autosave_period_s or None):
                     continue
+            self.save_if_changed()
+        if self._saving_last and self.is_due:
             self.save_if_changed()
 
 

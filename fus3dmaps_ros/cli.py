@@ -17,9 +17,11 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressC
 from rich.table import Table
 
 from fus3dmaps_core.config import Config
+from fus3dmaps_core.datasets.registry import names as dataset_names
 from fus3dmaps_core.errors import ConfigError, Fus3dmapsError, RecordingError
 
 if TYPE_CHECKING:
+    from fus3dmaps_core.frame import PosedFrame
     from fus3dmaps_core.query import RankedInstance
 
 app = typer.Typer(
@@ -49,7 +51,7 @@ def main() -> None:
 
 @app.command()
 def convert(
-    dataset: Annotated[str, typer.Argument(help="Layout of the folder: sevenscenes.")],
+    dataset: Annotated[str, typer.Argument(help=f"Layout of the folder: {', '.join(dataset_names())}.")],
     directory: Annotated[Path, typer.Argument(help="The dataset's folder.")],
     out: Annotated[Path, typer.Argument(help="Recording to write, ending in .mcap.")],
     overwrite: Overwrite = False,
@@ -135,6 +137,9 @@ def query(
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")] = False,
     png: Annotated[Path | None, typer.Option("--png", help="Draw the answer into this picture.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write voxel similarities to this PLY file.")] = None,
+    weights: Annotated[
+        str | None, typer.Option("--weights", help="Where the encoder's weights are, instead of where the map's were.")
+    ] = None,
 ) -> None:
     """Ask a saved map where something is."""
     from fus3dmaps_core.encoders.registry import load_text_encoder
@@ -152,7 +157,7 @@ def query(
         top or info.config.query.top_k,
         info.config.query.min_voxels,
     )
-    text_encoder = load_text_encoder(info.encoder, "cpu")
+    text_encoder = load_text_encoder(info.encoder, "cpu", info.config.encoder.weights if weights is None else weights)
     answer = answer_query(semantic_map, text_encoder, request, info.logit_scale)
     _print_answer(answer.instances, prompts, info.map_frame, as_json)
     if png is not None:
@@ -221,19 +226,49 @@ def ask(
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Argument(help="Recording to write, ending in .mcap.")],
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Frames along the way.")] = 60,
-    seed: Annotated[int, typer.Option("--seed", help="Decides textures and depth noise.")] = 0,
+    frames: Annotated[int | None, typer.Option("--frames", min=2, help="Frames along the way.")] = None,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Decides textures, furniture and depth noise.")] = 0,
+    rooms: Annotated[int, typer.Option("--rooms", min=0, help="A building with so many rooms a storey instead.")] = 0,
+    storeys: Annotated[int, typer.Option("--storeys", min=1, help="Storeys of the building.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
-    """Record a simulated furnished room in which real photographs hang."""
+    """Record a simulated furnished room in which real photographs hang, or a plain building of many rooms."""
     from fus3dmaps_core.recordings.writer import RecordingWriter
     from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+    from fus3dmaps_core.sources.simulated_building import SimulatedBuilding
 
+    source: Iterator[PosedFrame]
+    if rooms:
+        building = SimulatedBuilding(seed=seed, storeys=storeys, rooms_per_storey=rooms, frames=frames)
+        count, source = len(building), (labelled.frame for labelled in building)
+    else:
+        room = FurnishedRoom(seed=seed, frames=frames or 60)
+        count, source = len(room), iter(room)
     with _progress("rendering frames") as update, RecordingWriter(out, overwrite=overwrite) as writer:
-        for done, frame in enumerate(FurnishedRoom(seed=seed, frames=frames), start=1):
+        for done, frame in enumerate(source, start=1):
             writer.write(frame)
-            update(done, frames)
-    _out.print(f"{out}: {frames} frames", markup=False, soft_wrap=True)
+            update(done, count)
+    _out.print(f"{out}: {count} frames", markup=False, soft_wrap=True)
+
+
+@app.command()
+def evaluate(
+    target: Annotated[str, typer.Argument(help="simulation, or a dataset's layout as for convert.")] = "simulation",
+    directory: Annotated[Path | None, typer.Argument(help="The dataset's folder.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many buildings are simulated.")] = 5,
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller buildings, no sweeps.")] = False,
+    jobs: Annotated[int, typer.Option("--jobs", min=0, help="Buildings at once; 0: one for each processor.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write a JSON list of records to this file.")] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Write tables and plots into this directory.")] = None,
+    options: Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11.")] = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Measure how good maps are: on simulated buildings, or on a labelled dataset."""
+    from fus3dmaps_ros.evaluate_command import Destination, Evaluation, evaluate_target
+
+    request = Evaluation(target, directory, seeds, quick, jobs, _pairs("--option", options))
+    evaluate_target(request, _config(params_file, settings), Destination(json_file, report, _out), _progress)
 
 
 @app.command()
@@ -252,13 +287,18 @@ def demo(
 
 def _config(params_file: Path | None, settings: list[str] | None) -> Config:
     config = Config() if params_file is None else Config.from_yaml(params_file)
-    values: dict[str, Any] = {}
+    values = {key: yaml.safe_load(text) for key, text in _pairs("--set", settings).items()}
+    return config.with_values(values)
+
+
+def _pairs(option: str, settings: list[str] | None) -> dict[str, str]:
+    values: dict[str, str] = {}
     for setting in settings or ():
         key, equals, text = setting.partition("=")
         if not equals:
-            raise ConfigError(f"--set {setting}: expected key=value")
-        values[key.strip()] = yaml.safe_load(text)
-    return config.with_values(values)
+            raise ConfigError(f"{option} {setting}: expected key=value")
+        values[key.strip()] = text
+    return values
 
 
 def _print_answer(instances: Sequence[RankedInstance], prompts: Sequence[str], frame: str, as_json: bool) -> None:

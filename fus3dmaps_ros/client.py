@@ -74,14 +74,7 @@ class MapperClient:
         Raises:
             QueryError: The node refuses, with its own words, or does not answer in time.
         """
-        request = QueryText.Request(
-            prompts=list(prompts),
-            negative_prompts=list(negative_prompts),
-            layer=layer,
-            threshold=threshold,
-            top_k=top_k,
-            publish=publish,
-        )
+        request = QueryText.Request(prompts=list(prompts), **_options(negative_prompts, layer, threshold, top_k, publish))
         return self._call(self._query, request, timeout_s)
 
     def ask_image(
@@ -100,14 +93,7 @@ class MapperClient:
         Raises:
             QueryError: The node refuses, with its own words, or does not answer in time.
         """
-        request = QueryImage.Request(
-            image=image,
-            negative_prompts=list(negative_prompts),
-            layer=layer,
-            threshold=threshold,
-            top_k=top_k,
-            publish=publish,
-        )
+        request = QueryImage.Request(image=image, **_options(negative_prompts, layer, threshold, top_k, publish))
         return self._call_once(QueryImage, "query_image", request, timeout_s)
 
     def save_map(self, name: str, timeout_s: float = 60.0) -> SaveMap.Response:
@@ -185,6 +171,17 @@ class MapperClient:
         finally:
             self._node.destroy_subscription(subscription)
         raise QueryError(f"nothing new is published on {self._name}/{topic} within {timeout_s:.0f} s")
+
+
+def _options(negative_prompts: Sequence[str], layer: str, threshold: float, top_k: int, publish: bool) -> dict[str, Any]:
+    """The fields that questions by text and by image share."""
+    return {
+        "negative_prompts": list(negative_prompts),
+        "layer": layer,
+        "threshold": threshold,
+        "top_k": top_k,
+        "publish": publish,
+    }
 
 
 def ranked_instances(response: QueryText.Response | QueryImage.Response) -> list[RankedInstance]:

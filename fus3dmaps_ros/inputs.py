@@ -79,7 +79,6 @@ class Inputs:
         self._pairer = FramePairer(config.input, self._tf)
         group = MutuallyExclusiveCallbackGroup()
         self.streams = self._pairer.streams()
-        self._topics = [stream.topic for stream in self.streams]
         self._subscriptions = [
             node.create_subscription(
                 _TYPES[stream.msgtype],
@@ -102,16 +101,6 @@ class Inputs:
         with self._lock:
             self._pairer.reset()
 
-    def silent(self) -> list[str]:
-        """A phrase for every topic on which nothing has come yet, with the number of its publishers."""
-        with self._lock:
-            received = set(self._pairer.received)
-        return [
-            f"{subscription.topic_name} ({self._node.count_publishers(subscription.topic_name)} publishers)"
-            for topic, subscription in zip(self._topics, self._subscriptions, strict=True)
-            if topic not in received
-        ]
-
     def close(self) -> None:
         """Unsubscribe and forget what waits. Of no further use then; can be called again."""
         if self._timer is not None:
@@ -119,7 +108,7 @@ class Inputs:
             self._timer = None
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
-        self._subscriptions, self._topics = [], []
+        self._subscriptions = []
         if self._tf is not None:
             self._tf.close()
         self.reset()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import os
-import signal
 import sys
 import time
 import traceback
@@ -21,6 +20,7 @@ from std_msgs.msg import Header
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_core.sources.streams import uses_tf
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.autosave import Autosave
 from fus3dmaps_ros.drops import DropLog
@@ -34,13 +34,16 @@ from fus3dmaps_ros.parameters import declare_parameters, follow_changes, unknown
 from fus3dmaps_ros.query_services import QueryServices
 from fus3dmaps_ros.refusals import REFUSALS, one_line
 from fus3dmaps_ros.session import Session, SessionHolder
+from fus3dmaps_ros.signals import StopSignals
 from fus3dmaps_ros.status import StatusPublisher, status_line, status_message
+from fus3dmaps_ros.tf_poses import import_tf2_ros
+from fus3dmaps_ros.timed_calls import Deadline
 from fus3dmaps_ros.watch import Watch
 from fus3dmaps_ros.worker import FrameWorker
 
 NODE_NAME = "fus3dmaps"
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _STOP_TIMEOUT_S = 1.0
+_POLL_S = 0.05
 
 
 class MapperNode(ManagedNode):
@@ -100,9 +103,12 @@ class MapperNode(ManagedNode):
         """Load and warm up the models, resume a saved map where that is wanted, and offer topics and services.
 
         Raises:
+            ConfigError: TF is wanted and not installed.
             EncoderError: A model cannot be loaded.
         """
         logger, config = self.get_logger(), self.config
+        if uses_tf(config.input):
+            import_tf2_ros()  # Before the models are loaded for nothing.
         logger.info(f"loading encoder '{config.encoder.name}' and segmenter '{config.segmenter.name}'")
         started = time.monotonic()
         pipeline = self._make_pipeline(config)
@@ -159,25 +165,42 @@ class MapperNode(ManagedNode):
 
     def _end_session(self) -> None:
         autosave, self.autosave = self.autosave, None
-        session = self.session
-        if autosave is not None:
-            autosave.stop(self.config.node.service_timeout_s)
-            if self.config.node.autosave_period_s > 0:
-                autosave.save_if_changed()
-        self._sessions.replace(None)
-        if session is not None and not session.worker.stop(self.config.node.service_timeout_s):
+        session, timeout_s = self.session, self.config.node.service_timeout_s
+        if session is not None and not session.worker.stop(timeout_s):
             self.get_logger().warning("the frame in work goes on; its models are freed when it is done")
+        if autosave is not None and not autosave.stop(timeout_s, save=True):
+            self.get_logger().warning("the last save goes on; until it is complete the map saved before is the newest")
+        self._sessions.replace(None)
 
     def stop(self, timeout_s: float) -> bool:
-        """Unsubscribe and end the threads, whatever the state; whether mapping ended in time.
+        """Unsubscribe and end the mapping thread, whatever the state; whether it ended in time.
 
-        An automatic save in work is not waited for: cut off, it leaves the map that was saved before.
+        The map stays, and can still be saved by :meth:`save_last`.
         """
         self.deactivate()
-        if self.autosave is not None:
-            self.autosave.stop(0.0)
         session = self.session
         return session is None or session.worker.stop(timeout_s)
+
+    def save_last(self, hurried: Callable[[], bool]) -> bool:
+        """Save a map that is saved by period a last time, if it has changed, after :meth:`stop`.
+
+        Args:
+            hurried: Whether not to wait any longer; asked again and again.
+
+        Returns:
+            Whether no save is in work any more. One that was hurried or takes longer than ``node.service_timeout_s`` is; if
+            the process ends in it, the map that was saved before is left.
+        """
+        autosave = self.autosave
+        if autosave is None:
+            return True
+        if autosave.is_due:
+            self.get_logger().info("saving the map; another signal ends at once")
+        deadline = Deadline(self.config.node.service_timeout_s)
+        while not autosave.stop(min(_POLL_S, deadline.remaining_s()), save=True):
+            if hurried() or not deadline.remaining_s():
+                return False
+        return True
 
     def status(self) -> str:
         """One line on what came in, what was mapped, what was dropped and how large the map is."""
@@ -247,6 +270,9 @@ class MapperNode(ManagedNode):
 def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config) -> int:
     """Run the node until SIGINT or SIGTERM, in a process of its own.
 
+    A map that is saved by period is saved a last time then, unless that takes longer than ``node.service_timeout_s`` or
+    there is another signal.
+
     With ``node.autostart`` it is brought to map at once; otherwise it waits, unconfigured, for a lifecycle manager.
 
     Args:
@@ -257,8 +283,7 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
         Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
     """
     arguments = list(sys.argv[1:] if args is None else args)
-    for number in _SIGNALS:
-        signal.signal(number, signal.default_int_handler)
+    signals = StopSignals()
     code = 0
     node, executor = None, None
     try:
@@ -284,21 +309,25 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
     except Exception:
         traceback.print_exc()
         code = 1
-    _shut_down(node, executor, code)
+    _shut_down(node, executor, signals, code)
     return code
 
 
-def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, code: int) -> None:
-    """Take everything down within two seconds; a second signal cannot interrupt it."""
-    for number in _SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    answered = executor is None or executor.shutdown(_STOP_TIMEOUT_S / 2)
-    mapped = node is None or node.stop(_STOP_TIMEOUT_S)
+def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int) -> None:
+    """Take everything down within two seconds, but for a last save where that is due."""
+    signals.hold()
+    unfinished = []
+    if executor is not None and not executor.shutdown(_STOP_TIMEOUT_S / 2):
+        unfinished.append("call")
     if node is not None:
+        if not node.stop(_STOP_TIMEOUT_S):
+            unfinished.append("frame")
+        if not node.save_last(lambda: signals.hurried):
+            unfinished.append("save")
         node.destroy_node()
     rclpy.try_shutdown()
-    if not (answered and mapped):
-        print(f"{NODE_NAME}: ending in the middle of a {'frame' if answered else 'call'}", file=sys.stderr)
+    if unfinished:
+        print(f"{NODE_NAME}: ending in the middle of a {' and a '.join(unfinished)}", file=sys.stderr)
         # The interpreter's own end would wait for native code that is in work, or crash it.
         sys.stdout.flush()
         sys.stderr.flush()

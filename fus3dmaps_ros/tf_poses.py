@@ -15,6 +15,21 @@ from fus3dmaps_core.errors import ConfigError, FrameError
 from fus3dmaps_core.sources.transforms import NoTransform, TransformGap
 
 
+def import_tf2_ros() -> Any:
+    """The package through which TF is read.
+
+    Raises:
+        ConfigError: It is not installed; the message names the parameters that want it and what to install.
+    """
+    try:
+        return import_module("tf2_ros")
+    except ImportError as error:
+        raise ConfigError(
+            "parameters 'input.pose_source' and 'input.extrinsic_source': tf needs the Python package tf2_ros, which is"
+            f" not installed ({error}); on Ubuntu: apt install ros-jazzy-tf2-ros-py"
+        ) from None
+
+
 class TfListener:
     """Listens to ``/tf`` and ``/tf_static`` through tf2_ros and answers lookups without waiting.
 
@@ -31,14 +46,7 @@ class TfListener:
         Raises:
             ConfigError: tf2_ros is not installed.
         """
-        try:
-            tf2_ros: Any = import_module("tf2_ros")
-        except ImportError as error:
-            raise ConfigError(
-                "parameters 'input.pose_source' and 'input.extrinsic_source': tf needs the Python package tf2_ros, which is"
-                f" not installed ({error}); on Ubuntu: apt install ros-jazzy-tf2-ros-py"
-            ) from None
-        self._tf2_ros = tf2_ros
+        self._tf2_ros = tf2_ros = import_tf2_ros()
         self._buffer = tf2_ros.Buffer()
         self._listener = tf2_ros.TransformListener(self._buffer, node)
 

@@ -25,7 +25,7 @@ OVERRIDES = (
     ("odometry_topic", ("input.odometry_topic",), "Poses, for pose_source odometry."),
 )
 # What RViz shows of the node; its configuration names them without a namespace.
-SHOWN = ("map", "similarity", "instances", "answer", "path")
+SHOWN = ("map", "labels", "similarity", "instances", "answer", "detections", "path")
 
 
 def generate_launch_description():
@@ -51,6 +51,12 @@ def generate_launch_description():
             DeclareLaunchArgument("namespace", default_value="", description="Namespace of the node and its inputs."),
             DeclareLaunchArgument(
                 "use_sim_time", default_value="false", choices=list(BOOLEANS), description="Take time from /clock."
+            ),
+            DeclareLaunchArgument(
+                "autostart",
+                default_value="",
+                choices=["", *BOOLEANS],
+                description="false: wait, unconfigured, for a manager of lifecycle nodes; true: load and map at once.",
             ),
             DeclareLaunchArgument("log_level", default_value="info", description="debug, info, warn, error or fatal."),
             DeclareLaunchArgument("rviz", default_value="false", choices=list(BOOLEANS), description="Start RViz as well."),
@@ -121,6 +127,8 @@ def overrides(given):
     }
     if given["window_radius_m"]:
         values["fusion.window_radius_m"] = float(given["window_radius_m"])
+    if given["autostart"]:
+        values["node.autostart"] = is_true(given["autostart"])
     return values
 
 

@@ -136,8 +136,10 @@ _numbers = itertools.count()
 class Robot:
     """A mapper node with stand-in models, and a second node that plays the camera and the user.
 
-    It publishes what the parameters ask for: poses from the source, images in the transport. ``makers`` holds what makes the
-    message of each publisher from a frame; images in a transport other than raw need one from the test.
+    It publishes what the parameters ask for: poses from the source, images in the transport, those of each of several
+    cameras, a camera model of depth that is not registered. ``makers`` holds what makes the message of each publisher from a
+    frame; the test brings it for images in a transport other than raw and for the model of the depth camera. With several
+    cameras the names start with theirs: ``front/rgb``.
     """
 
     def __init__(self, make_pipeline: Callable[[Any], Pipeline] = stand_in_pipeline, **parameters: Any) -> None:
@@ -157,13 +159,19 @@ class Robot:
         self._threads.__enter__()
         qos = input_qos("reliable", 100)
         source = parameters.get("input.pose_source", "pose")
-        outlets = {"info": (CameraInfo, "rgb/camera_info", camera_info_message)}
+        outlets: dict[str, tuple[Any, str, Any]] = {}
         if source in POSES:
             outlets["pose"] = POSES[source]
-        for name, make in (("rgb", rgb_message), ("depth", depth_message)):
-            transport = parameters.get(f"input.{name}_transport", "raw")
-            raw = transport == "raw"
-            outlets[name] = (Image if raw else CompressedImage, f"{name}/image" + ("" if raw else f"/{transport}"), make)
+        cameras = str(parameters.get("input.cameras", ""))
+        for camera in (f"{name}/" if name else "" for name in cameras.split(",")):
+            outlets[f"{camera}info"] = (CameraInfo, f"{camera}rgb/camera_info", camera_info_message)
+            if not parameters.get("input.depth_registered", True):
+                outlets[f"{camera}depth_info"] = (CameraInfo, f"{camera}depth/camera_info", None)
+            for name, make in (("rgb", rgb_message), ("depth", depth_message)):
+                transport = parameters.get(f"input.{name}_transport", "raw")
+                raw = transport == "raw"
+                topic = f"{camera}{name}/image" + ("" if raw else f"/{transport}")
+                outlets[f"{camera}{name}"] = (Image if raw else CompressedImage, topic, make)
         self.makers: dict[str, Callable[[PosedFrame], Any]] = {name: make for name, (_, _, make) in outlets.items()}
         self.publishers = {
             name: self.user.create_publisher(message_type, topic, qos) for name, (message_type, topic, _) in outlets.items()
@@ -176,16 +184,17 @@ class Robot:
         """Wait until the camera's messages reach the node, which must be active."""
         wait_until(lambda: all(outlet.get_subscription_count() for outlet in self.publishers.values()), "inputs matched")
 
-    def show(self, frame: PosedFrame) -> None:
-        """Publish all that belongs to a frame."""
+    def show(self, frame: PosedFrame, camera: str = "") -> None:
+        """Publish all that belongs to a frame, of one of several cameras where it is named."""
         for name, publisher in self.publishers.items():
-            publisher.publish(self.makers[name](frame))
+            if name == "pose" or name.rpartition("/")[0] == camera:
+                publisher.publish(self.makers[name](frame))
 
-    def map(self, frame: PosedFrame) -> None:
+    def map(self, frame: PosedFrame, camera: str = "") -> None:
         """Publish a frame and wait until it is in the map."""
         worker = self.mapper.worker
         revision = worker.revision
-        self.show(frame)
+        self.show(frame, camera)
         wait_until(
             lambda: worker.stamp_ns == frame.stamp_ns and worker.revision > revision, f"frame {frame.stamp_ns} mapped"
         )
@@ -207,6 +216,8 @@ class Robot:
     def close(self) -> None:
         self._threads.__exit__()
         assert self.mapper.stop(TIMEOUT_S)
+        autosave = self.mapper.autosave
+        assert autosave is None or autosave.stop(TIMEOUT_S)
         self.mapper.destroy_node()
         self.user.destroy_node()
         rclpy.shutdown(context=self.context)

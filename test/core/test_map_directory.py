@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_core.map_directory import MAX_NAME_BYTES, list_maps, map_path, map_root, newest_map
+from fus3dmaps_core.map_directory import MAX_NAME_BYTES, list_maps, map_path, map_root
 from fus3dmaps_core.storage import load_map, save_map
 
 
@@ -127,8 +127,7 @@ def test_maps_are_listed_by_the_time_of_their_save(tmp_path: Path):
         save_map(map_path(tmp_path, name), semantic_map, INFO, saved_ns=saved_ns)
     os.utime(tmp_path / "oldest" / "manifest.json")  # Times of files do not count: copies of maps have others.
     assert list_maps(tmp_path) == ["newest", "a", "b", "oldest"]
-    assert newest_map(tmp_path) == tmp_path / "newest"
-    load_map(newest_map(tmp_path))
+    load_map(map_path(tmp_path, "newest"))
 
 
 def test_what_cannot_be_read_is_not_listed(tmp_path: Path):
@@ -142,19 +141,16 @@ def test_what_cannot_be_read_is_not_listed(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "out").symlink_to(tmp_path.parent)
     assert list_maps(tmp_path) == ["good"]
-    assert newest_map(tmp_path) == tmp_path / "good"
 
 
 def test_a_directory_without_maps_has_none(tmp_path: Path):
     for root in (tmp_path, tmp_path / "not_there"):
         assert list_maps(root) == []
-        assert newest_map(root) is None
 
 
 def test_a_directory_that_cannot_be_listed_is_named(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    for listed in (list_maps, newest_map):
-        with pytest.raises(StorageError, match="file"):
-            listed(tmp_path / "file")
+    with pytest.raises(StorageError, match="file"):
+        list_maps(tmp_path / "file")
     with pytest.raises(StorageError, match="maps"):
         list_maps("maps\0")

@@ -5,12 +5,16 @@ from __future__ import annotations
 import fcntl
 import os
 import signal
+import subprocess
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
+from rclpy.context import Context
+from rclpy.node import Node
 
 
 def _claim_domain() -> Any:
@@ -32,7 +36,8 @@ def _claim_domain() -> Any:
 
 _domain_lock = _claim_domain()
 
-from robot import Robot  # noqa: E402  (the domain must be chosen first)
+from node_process import start_process  # noqa: E402  (the domain must be chosen first)
+from robot import CallbackThreads, Robot  # noqa: E402
 from stand_ins import wall_frame  # noqa: E402
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -70,6 +75,34 @@ def mapped_robot() -> Iterator[Robot]:
 def stamp_ns() -> int:
     """Stamp of the frame that ``mapped_robot`` has mapped."""
     return STAMP_NS
+
+
+@pytest.fixture
+def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Starts processes that do not outlive the test; keywords are further environment variables."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def begin(command: list[str], **environment: str) -> subprocess.Popen[str]:
+        processes.append(start_process(command, **environment))
+        return processes[-1]
+
+    yield begin
+    for process in processes:
+        if process.poll() is None:
+            process.kill()
+        process.communicate()
+
+
+@pytest.fixture
+def user() -> Iterator[Node]:
+    """A node beside those processes."""
+    context = Context()
+    rclpy.init(args=[], context=context)
+    node = Node("user", context=context)
+    with CallbackThreads(context, node):
+        yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
 
 
 @pytest.fixture

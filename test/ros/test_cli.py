@@ -141,6 +141,7 @@ def test_refusals_are_one_line_that_names_what_is_wrong(run: Run, recording: Pat
     refused(run("query", map_directory, "cat", "--layer", "sparse"), "layer", "sparse")
     refused(run("query", map_directory, "cat", "--not", ""), "negative_prompts[0]")
     refused(run("query", tmp_path / "no_map", "cat"), "no_map")
+    refused(run("query", map_directory, "cat", "--weights", "mine.pt"), "encoder.weights", "mine.pt")
     refused(run("map", tmp_path / "no_bag.mcap", "--out", tmp_path / "m"), "no_bag.mcap")
     refused(run("map", recording, "--out", tmp_path / "m", "--set", "map.voxel_size_m=-1"), "map.voxel_size_m")
     refused(run("map", recording, "--out", tmp_path / "m", "--set", "map.size=1"), "map.size")

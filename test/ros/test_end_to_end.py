@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
-from rclpy.context import Context
+from node_process import RELIABLE_ARGUMENTS, STAND_IN, end, wait_for_line
 from rclpy.node import Node
-from robot import RELIABLE_INPUTS, TIMEOUT_S, CallbackThreads, wait_until
+from robot import TIMEOUT_S, wait_until
 from sensor_msgs.msg import PointCloud2
 from stand_ins import wall_frame
 
@@ -24,47 +20,9 @@ from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.conversions import from_cloud
 from fus3dmaps_ros.outputs import LATCHED
 
-ROOT = Path(__file__).resolve().parents[2]
-STAND_IN = [sys.executable, str(ROOT / "test" / "ros" / "stand_in_node.py")]
-RELIABLE_ARGUMENTS = ["--ros-args", *(word for key in RELIABLE_INPUTS for word in ("-p", f"{key}:=reliable"))]
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 100_000_000
 FRAMES = 60
-
-
-@pytest.fixture
-def start() -> Iterator[Callable[..., subprocess.Popen[str]]]:
-    """Starts processes that do not outlive the test."""
-    processes: list[subprocess.Popen[str]] = []
-
-    def begin(command: list[str], **environment: str) -> subprocess.Popen[str]:
-        paths = os.pathsep.join([str(ROOT), str(ROOT / "test"), os.environ.get("PYTHONPATH", "")])
-        process = subprocess.Popen(
-            command,
-            env={**os.environ, "PYTHONPATH": paths, **environment},
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        processes.append(process)
-        return process
-
-    yield begin
-    for process in processes:
-        if process.poll() is None:
-            process.kill()
-        process.communicate()
-
-
-@pytest.fixture
-def user() -> Iterator[Node]:
-    context = Context()
-    rclpy.init(args=[], context=context)
-    node = Node("user", context=context)
-    with CallbackThreads(context, node):
-        yield node
-    node.destroy_node()
-    rclpy.shutdown(context=context)
 
 
 @pytest.fixture(scope="module")
@@ -84,16 +42,6 @@ def ask(user: Node, client: Any, **fields: Any) -> Any:
 
 def stamp_of(message: Any) -> int:
     return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-
-
-def end(process: subprocess.Popen[str], number: signal.Signals) -> str:
-    """Signal a node, which must end well and say nothing untoward; its log."""
-    process.send_signal(number)
-    output, _ = process.communicate(timeout=TIMEOUT_S)
-    assert process.returncode == 0, output
-    assert "Traceback" not in output
-    assert "exception" not in output.lower()
-    return output
 
 
 def test_queries_are_answered_while_a_recording_is_mapped(start, user, bag) -> None:
@@ -145,8 +93,6 @@ def test_a_signal_in_the_middle_of_an_inference_ends_the_node_well(start, user, 
     client = user.create_client(QueryText, "/fus3dmaps/query_text")
     assert client.wait_for_service(TIMEOUT_S)
     player = start([sys.executable, "-m", "fus3dmaps_ros.player_node", str(bag), "--rate", "10"])
-    assert node.stdout is not None
-    lines = iter(node.stdout.readline, "")
-    assert any("queue_full" in line for line in lines), "the node never got busy"
+    wait_for_line(node, "queue_full")
     assert "ending in the middle of a frame" in end(node, signal.SIGTERM)
     player.communicate(timeout=TIMEOUT_S)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +15,7 @@ import numpy as np
 import pytest
 from compressed_messages import compressed_depth_rvl, jpeg
 from robot import (
+    TIMEOUT_S,
     Robot,
     camera_info_message,
     compressed_message,
@@ -211,13 +214,32 @@ def test_depth_without_a_reading_maps_nothing(robot) -> None:
     assert len(before["voxel_coordinates"]) < len(content(robot)["voxel_coordinates"])
 
 
-def test_ten_times_the_rate_drops_the_oldest_and_counts_them(heard) -> None:
+def test_ten_times_the_rate_drops_the_oldest_and_counts_them(heard, monkeypatch) -> None:
     robot, drops = heard(**{"node.queue_size": 2})
-    for number in range(1, 151):
+    process = robot.mapper.pipeline.process
+
+    def ten_times_slower(frame: PosedFrame) -> Any:
+        target = counted() + 10
+        wait_until(lambda: counted() >= target or flooded.is_set(), "ten frames came meanwhile")
+        return process(frame)
+
+    def counted() -> int:
+        return robot.mapper.worker.counts().frames
+
+    flooded = threading.Event()
+    monkeypatch.setattr(robot.mapper.pipeline, "process", ten_times_slower)
+    numbers = itertools.count(1)
+
+    def show_another() -> bool:
+        number = next(numbers)
         robot.show(wall_frame(START_NS + number * SECOND_NS // 300, x_m=0.02 * number))
-    wait_until(lambda: robot.mapper.worker.counts().frames > 100, "most frames were offered")
+        return robot.mapper.drops.counts()["queue_full"] >= 30
+
+    wait_until(show_another, "thirty frames had to go")
+    flooded.set()
     wait_until(lambda: not robot.mapper.worker.waiting, "the queue is empty")
     assert any(reason == "queue_full" for reason, _ in drops)
+    monkeypatch.undo()
     check_it_lives(robot, START_NS + 20 * SECOND_NS)
 
 
@@ -263,7 +285,7 @@ def test_odd_prompts_are_answered_or_refused(mapped_robot, prompt: str, success:
 def test_a_hundred_queries_at_once_are_all_answered(robot) -> None:
     robot.map(wall_frame(START_NS))
     client = robot.user.create_client(QueryText, "fus3dmaps/query_text")
-    assert client.wait_for_service(10.0)
+    assert client.wait_for_service(TIMEOUT_S)
     futures = [client.call_async(QueryText.Request(prompts=["red"])) for _ in range(100)]
     wait_until(lambda: all(future.done() for future in futures), "100 replies")
     replies = [future.result() for future in futures]

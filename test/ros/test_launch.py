@@ -148,6 +148,7 @@ def test_every_argument_sets_parameters_that_exist(description) -> None:
         "odometry_topic": "/f",
         "window_radius_m": "6.5",
         "use_sim_time": "True",
+        "autostart": "False",
     }
     _, values = parameters(launch(description, **given)["fus3dmaps_ros"])
     assert values.pop("use_sim_time") is True
@@ -161,6 +162,21 @@ def test_every_argument_sets_parameters_that_exist(description) -> None:
         "/f",
     )
     assert (config.input.pose_source, config.fusion.window_radius_m) == ("odometry", 6.5)
+    assert config.node.autostart is False
+    assert given.keys() == arguments_of(description).keys() - {
+        "camera",
+        "params_file",
+        "namespace",
+        "log_level",
+        "rviz",
+        "foxglove",
+    }
+
+
+@pytest.mark.parametrize(("given", "set_to"), [("true", True), ("True", True), ("false", False), ("", None)])
+def test_autostart_is_what_the_files_say_unless_it_is_given(description, given, set_to) -> None:
+    _, values = parameters(launch(description, autostart=given)["fus3dmaps_ros"])
+    assert values.get("node.autostart") is set_to
 
 
 def test_rviz_and_foxglove_start_where_asked(description) -> None:
@@ -189,8 +205,13 @@ def published() -> dict[str, str]:
             if isinstance(call, ast.Call) and isinstance(call.func, ast.Attribute) and call.func.attr == "create_publisher":
                 message, topic = call.args[:2]
                 if isinstance(topic, ast.Constant):
-                    found[topic.value.replace("~", f"/{NODE_NAME}")] = ast.unparse(message)
+                    found[topic.value.replace("~", f"/{NODE_NAME}")] = ast.unparse(message).rpartition(".")[2]
     return found
+
+
+def displayed() -> dict[str, str]:
+    """Those of them that are something to look at: all but the report of how the node fares."""
+    return {topic: kind for topic, kind in published().items() if kind not in ("MapperStatus", "DiagnosticArray")}
 
 
 def rviz_displays() -> list[dict[str, Any]]:
@@ -201,15 +222,28 @@ def rviz_topics() -> set[str]:
     return {display["Topic"]["Value"] for display in rviz_displays() if "Topic" in display}
 
 
-def test_rviz_shows_what_the_node_publishes_as_what_it_is() -> None:
+def test_rviz_shows_everything_to_look_at_as_what_it_is() -> None:
     shown = {
-        display["Topic"]["Value"]: display["Class"].removeprefix("rviz_default_plugins/")
-        for display in rviz_displays()
-        if "Topic" in display
+        display["Topic"]["Value"]: display["Class"].rpartition("/")[2] for display in rviz_displays() if "Topic" in display
     }
-    assert set(shown) == {f"/{NODE_NAME}/{name}" for name in ("map", "similarity", "instances", "answer", "path")}
-    types = published()
-    assert shown == {topic: types.get(topic) for topic in shown}
+    assert {topic.rpartition("/")[2] for topic in shown} >= {"map", "labels", "similarity", "instances", "answer", "path"}
+    assert shown == displayed()
+
+
+def test_rviz_does_without_the_package_of_the_detections() -> None:
+    """Of which ~/answer shows the same: a display whose plugin is missing says so in the list, no more."""
+    plugins = {
+        display["Name"]: (display["Class"].partition("/")[0], display["Enabled"])
+        for display in rviz_displays()
+        if not display["Class"].startswith("rviz_default_plugins/")
+    }
+    assert plugins == {"Detections": ("vision_msgs_rviz_plugins", False)}
+
+
+def test_of_clouds_in_one_place_the_answer_is_outermost() -> None:
+    """Boxes a little larger than those of the map: labels cover it, and the similarities of a question both."""
+    sizes = {display["Name"]: display["Size (m)"] for display in rviz_displays() if "Size (m)" in display}
+    assert sizes["Map"] == Config().map.voxel_size_m < sizes["Labels"] < sizes["Similarity"]
 
 
 def test_rviz_asks_for_latched_topics_in_the_frame_of_the_map_and_shows_tf() -> None:
@@ -239,8 +273,7 @@ def test_foxglove_lays_out_every_panel_once(layout) -> None:
 
 def test_foxglove_shows_what_the_node_publishes(layout) -> None:
     panels = layout["configById"]
-    assert set(panels["3D!map"]["topics"]) == rviz_topics()
-    assert set(panels["3D!map"]["topics"]) <= published().keys()
+    assert set(panels["3D!map"]["topics"]) == displayed().keys()
     assert panels["3D!map"]["followTf"] == Config().input.map_frame
     assert panels["DiagnosticSummary!health"]["topicToRender"] == "/diagnostics"
     inputs = Config().input
@@ -251,6 +284,8 @@ def test_foxglove_shows_what_the_node_publishes(layout) -> None:
 def test_foxglove_asks_a_question_that_the_service_takes(layout) -> None:
     panel = layout["configById"]["CallService!query"]
     assert panel["serviceName"] == f"/{NODE_NAME}/query_text"
-    request = QueryText.Request(**json.loads(panel["requestPayload"]))
+    payload = json.loads(panel["requestPayload"])
+    assert payload.keys() <= QueryText.Request.get_fields_and_field_types().keys()
+    request = QueryText.Request(**payload)
     assert request.prompts
     assert request.publish

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import rclpy
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from node_process import STAND_IN, end
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from robot import Robot, stand_in_pipeline, wait_until
+from robot import TIMEOUT_S, Robot, stand_in_pipeline, wait_until
 from stand_ins import wall_frame
 from std_srvs.srv import Trigger
 
@@ -270,38 +267,21 @@ def test_finalizing_gives_everything_back_once(fragile) -> None:
     assert (node.done, node.state) == (["configure", "activate", "deactivate", "cleanup"], "finalized")
 
 
-def test_a_process_without_autostart_waits_for_its_manager(robot) -> None:
-    stand_in = Path(__file__).with_name("stand_in_node.py")
-    paths = os.pathsep.join([str(stand_in.parents[2]), str(stand_in.parents[1]), os.environ.get("PYTHONPATH", "")])
-    process = subprocess.Popen(
-        [sys.executable, str(stand_in), "--ros-args", "-p", "node.autostart:=false", "-r", f"__ns:={robot.namespace}/other"],
-        env={**os.environ, "PYTHONPATH": paths},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-    try:
-        own = f"{robot.namespace}/other/fus3dmaps"
-        get_state = robot.user.create_client(GetState, f"{own}/get_state")
-        change_state = robot.user.create_client(ChangeState, f"{own}/change_state")
-        assert get_state.wait_for_service(60)
-        assert change_state.wait_for_service(60)
+def test_a_process_without_autostart_waits_for_its_manager(start, user) -> None:
+    process = start([*STAND_IN, "--ros-args", "-p", "node.autostart:=false"])
+    get_state = user.create_client(GetState, "/fus3dmaps/get_state")
+    change_state = user.create_client(ChangeState, "/fus3dmaps/change_state")
+    assert get_state.wait_for_service(TIMEOUT_S)
+    assert change_state.wait_for_service(TIMEOUT_S)
 
-        def state() -> str:
-            future = get_state.call_async(GetState.Request())
-            wait_until(future.done, "the state")
-            return future.result().current_state.label
+    def state() -> str:
+        future = get_state.call_async(GetState.Request())
+        wait_until(future.done, "the state")
+        return future.result().current_state.label
 
-        assert state() == "unconfigured"
-        for transition, reached in ((CONFIGURE, "inactive"), (ACTIVATE, "active"), (DEACTIVATE, "inactive")):
-            future = change_state.call_async(ChangeState.Request(transition=Transition(id=transition)))
-            wait_until(future.done, reached)
-            assert state() == reached
-        process.send_signal(signal.SIGTERM)
-        output, _ = process.communicate(timeout=60)
-        assert process.returncode == 0, output
-        assert "Traceback" not in output
-    finally:
-        if process.poll() is None:
-            process.kill()
-            process.communicate()
+    assert state() == "unconfigured"
+    for transition, reached in ((CONFIGURE, "inactive"), (ACTIVATE, "active"), (DEACTIVATE, "inactive")):
+        future = change_state.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        wait_until(future.done, reached)
+        assert state() == reached
+    end(process, signal.SIGTERM)

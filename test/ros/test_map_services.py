@@ -231,9 +231,9 @@ def test_a_change_that_could_not_begin_in_time_never_happens(robot, gate, servic
     assert not late.success
     assert "0.3 s" in late.message
     assert "as it was" in late.message
+    limit(robot, 60.0)
     assert robot.call(QueryText, "query_text", prompts=["red"]).success
     gate.open()
-    limit(robot, 30.0)
     robot.mapper.worker.between_frames(lambda: None).result(60)
     assert_same_bytes(state_of(robot), before)
 
@@ -338,4 +338,25 @@ def test_autosave_can_be_switched_on_while_the_node_runs_and_clean_up_saves_a_la
     assert robot.mapper.set_parameters([Parameter("node.autosave_period_s", value=3600.0)])[0].successful
     state = state_of(robot)
     robot.mapper.finalize()
+    assert_same_bytes(load_map(maps / NAMES[0])[0].export_state(), state)
+
+
+def test_a_last_save_that_takes_too_long_is_left_to_itself_and_completes(make_robot, maps, gate, monkeypatch, capfd) -> None:
+    save = map_store.save_map
+
+    def slow(*arguments: Any) -> int:
+        gate.pass_through()
+        return save(*arguments)
+
+    robot = make_robot(**{"node.map_directory": str(maps), "node.autosave_period_s": 3600.0})
+    robot.map(wall_frame(STAMP_NS))
+    state = state_of(robot)
+    monkeypatch.setattr(map_store, "save_map", slow)
+    limit(robot, 0.2)
+    robot.mapper.finalize()
+    assert robot.mapper.session is None
+    assert "the last save goes on" in capfd.readouterr().err
+    assert list_maps(maps) == []
+    gate.open()
+    wait_until(lambda: list_maps(maps) == [NAMES[0]], "the save completed")
     assert_same_bytes(load_map(maps / NAMES[0])[0].export_state(), state)

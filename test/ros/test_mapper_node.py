@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import pytest
@@ -46,6 +47,18 @@ def test_a_model_that_cannot_be_loaded_is_a_refusal_too(signals, capfd) -> None:
 
     assert main([], fail) == 1
     assert "fus3dmaps: parameter 'encoder.name': unknown encoder 'huge'" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("source", ["pose_source", "extrinsic_source"])
+def test_tf_without_its_package_is_refused_before_the_models_are_loaded(signals, capfd, monkeypatch, source) -> None:
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)  # As if it were not installed.
+    arguments = ["--ros-args", "-p", f"input.{source}:=tf", "-p", "input.body_frame:=base_link"]
+    assert main(arguments, lambda config: pytest.fail("models were loaded")) == 1
+    output = capfd.readouterr().err
+    assert "Traceback" not in output
+    (line,) = [line for line in output.splitlines() if line.startswith("fus3dmaps: ")]
+    assert f"input.{source}" in line
+    assert "apt install ros-jazzy-tf2-ros-py" in line
 
 
 def test_a_signal_while_models_load_is_a_clean_end(signals, capfd) -> None:

@@ -13,7 +13,7 @@ import threading
 import time
 from pathlib import Path
 
-from robot import Robot, wait_until
+from robot import TIMEOUT_S, Robot, wait_until
 from stand_ins import wall_frame
 
 from fus3dmaps_core.map_directory import map_path
@@ -46,7 +46,7 @@ def handles() -> int:
 def drive(robot: Robot, duration_s: float, number: int) -> int:
     """Frames along a wall and back, with questions and saves; returns the number of the next frame."""
     client = robot.user.create_client(QueryText, "fus3dmaps/query_text")
-    assert client.wait_for_service(10.0)
+    assert client.wait_for_service(TIMEOUT_S)
     started = asked = saved = time.monotonic()
     answers = []
     while time.monotonic() - started < duration_s or number < KEPT_FRAMES:

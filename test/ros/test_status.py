@@ -20,6 +20,8 @@ def test_the_status_tells_what_came_what_was_lost_and_what_the_map_takes(make_ro
     broken.encoding = "yuv422"
     robot.publishers["rgb"].publish(broken)
     wait_until(lambda: robot.mapper.drops.counts(), "a drop")
+    now_s = time.monotonic()
+    robot.mapper._watch.diagnosis._clock = lambda: now_s  # Rates are those of the last seconds: let none pass.
     received = robot.listen(MapperStatus, "status")
     status = wait_until(lambda: next((each for each in received if each.drop_reasons), None), "status received")
 
