@@ -1,1 +1,1 @@
-"""Sources of posed frames: recordings, datasets and simulated scenes."""
+"""Sources of posed frames: recordings and simulated scenes; datasets become recordings."""

@@ -1,33 +1,14 @@
-"""Datasets by name, and their conversion into recordings. A new format is a new module and a line here."""
+"""Conversion of datasets into recordings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
-from typing import Protocol, cast
 
 from fus3dmaps_core.config import InputConfig
-from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_core.frame import PosedFrame
+from fus3dmaps_core.datasets.registry import open_dataset
 from fus3dmaps_core.recordings.writer import RecordingWriter
-
-_FORMATS = {
-    "sevenscenes": ("fus3dmaps_core.sources.sevenscenes", "SevenScenes"),
-}
-
-
-class Dataset(Protocol):
-    """A posed RGB-D sequence in a directory."""
-
-    def __len__(self) -> int:
-        """Number of frames."""
-        ...
-
-    def __iter__(self) -> Iterator[PosedFrame]:
-        """The frames in order of their stamps."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -45,46 +26,32 @@ class ConversionSummary:
     size_bytes: int
 
 
-def names() -> list[str]:
-    """Names of the known dataset formats."""
-    return sorted(_FORMATS)
-
-
-def open_dataset(format_name: str, directory: Path) -> Dataset:
-    """Open a dataset of a named format.
-
-    Raises:
-        RecordingError: The format is unknown, or the directory is not of this format.
-    """
-    if format_name not in _FORMATS:
-        raise RecordingError(f"unknown dataset format '{format_name}', known are {', '.join(names())}")
-    module, name = _FORMATS[format_name]
-    return cast(Callable[[Path], Dataset], getattr(import_module(module), name))(directory)
-
-
 def convert(
-    format_name: str,
+    layout: str,
     directory: Path,
     out: Path,
     config: InputConfig | None = None,
     *,
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
+    **options: object,
 ) -> ConversionSummary:
     """Write a dataset as a rosbag2 recording.
 
     Args:
-        format_name: One of :func:`names`.
+        layout: One of :func:`fus3dmaps_core.datasets.registry.names`.
         directory: Where the dataset is.
         out: Recording to write, must end in ``.mcap``; appears only if the conversion succeeds.
         config: Topics and frames of the recording.
         overwrite: Whether an existing file is replaced.
         on_progress: Called after each frame with the number done and the number of all.
+        options: Of the dataset, e.g. ``scene`` or ``stride``.
 
     Raises:
         RecordingError: The dataset cannot be read or the recording not be written; the message names the file.
+        ConfigError: An option is unknown or of the wrong type.
     """
-    dataset = open_dataset(format_name, directory)
+    dataset = open_dataset(layout, directory, **options)
     total = len(dataset)
     first_ns = last_ns = 0
     with RecordingWriter(out, config, overwrite=overwrite) as writer:

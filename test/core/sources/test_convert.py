@@ -7,10 +7,10 @@ import pytest
 from recorded_frames import assert_same_frames, noise_frames, write_sevenscenes
 
 from fus3dmaps_core.config import ImageConfig, InputConfig
+from fus3dmaps_core.datasets.registry import open_dataset
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.sources.bag import BagSource
-from fus3dmaps_core.sources.convert import convert, names, open_dataset
-from fus3dmaps_core.sources.sevenscenes import SevenScenes
+from fus3dmaps_core.sources.convert import convert
 
 
 @pytest.fixture
@@ -36,11 +36,14 @@ def test_a_converted_dataset_gives_the_same_frames(sequence, tmp_path):
     assert_same_frames(frames, stored)
 
 
-def test_formats_are_known_by_name(sequence, tmp_path):
-    assert "sevenscenes" in names()
-    assert isinstance(open_dataset("sevenscenes", sequence), SevenScenes)
+def test_an_unknown_layout_is_named(sequence, tmp_path):
     with pytest.raises(RecordingError, match=r"'kitti'.*sevenscenes"):
         convert("kitti", sequence, tmp_path / "out.mcap")
+
+
+def test_options_reach_the_dataset(sequence, tmp_path):
+    out = tmp_path / "out.mcap"
+    assert convert("sevenscenes", sequence.parent, out, scene="seq-01", stride=2).frames == 2
 
 
 def test_a_failed_conversion_leaves_no_file(sequence, tmp_path):

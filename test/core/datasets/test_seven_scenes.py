@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from recorded_frames import noise_frames, write_sevenscenes
 
+from fus3dmaps_core.datasets.seven_scenes import SevenScenes
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_core.sources.sevenscenes import SevenScenes
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def test_a_missing_file_is_named(sequence, name):
 
 def test_two_colour_images_of_one_frame_are_named(sequence):
     (sequence / "frame-000004.color.jpg").write_bytes(b"")
-    with pytest.raises(RecordingError, match=r"frame 4 has two colour images.*color\.(png|jpg)'"):
+    with pytest.raises(RecordingError, match=r"color\.jpg' and 'frame-000004\.color\.png' are both number 4"):
         SevenScenes(sequence)
 
 
@@ -72,7 +72,7 @@ def test_a_folder_without_frames_names_its_sequences(sequence, tmp_path):
     with pytest.raises(RecordingError, match="nowhere' is not a directory"):
         SevenScenes(tmp_path / "nowhere")
     (tmp_path / "bare").mkdir()
-    with pytest.raises(RecordingError, match="bare' holds no frame"):
+    with pytest.raises(RecordingError, match="bare' holds no file like frame-"):
         SevenScenes(tmp_path / "bare")
 
 
@@ -88,12 +88,6 @@ def _png(array) -> bytes:
         ("frame-000004.depth.png", b""),
         ("frame-000004.depth.png", _png(np.zeros((4, 4), np.uint8))),
         ("frame-000004.depth.png", _png(np.zeros((4, 4, 3), np.uint16))),
-        ("frame-000004.pose.txt", b""),
-        ("frame-000004.pose.txt", b"1 0 0 0\n0 1 0 0\n0 0 1 0\n"),
-        ("frame-000004.pose.txt", b"1 0 0 0\n0 1 0 nan\n0 0 1 0\n0 0 0 1\n"),
-        ("frame-000004.pose.txt", b"1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n"),
-        ("frame-000004.pose.txt", b"one two three\n"),
-        ("frame-000004.pose.txt", b"\xff\xfe\x00"),
     ],
 )
 def test_an_odd_file_is_named_and_the_frames_before_it_are_given(sequence, name, content):
@@ -102,6 +96,29 @@ def test_an_odd_file_is_named_and_the_frames_before_it_are_given(sequence, name,
     next(frames)
     with pytest.raises(RecordingError, match=name):
         next(frames)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"1 0 0 0\n0 1 0 0\n0 0 1 0\n",
+        b"1 0 0 0\n0 1 0 nan\n0 0 1 0\n0 0 0 1\n",
+        b"1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n",
+        b"one two three\n",
+        b"\xff\xfe\x00",
+    ],
+)
+def test_an_odd_pose_is_named_before_any_frame(sequence, content):
+    (sequence / "frame-000004.pose.txt").write_bytes(content)
+    with pytest.raises(RecordingError, match=r"frame-000004\.pose\.txt"):
+        SevenScenes(sequence)
+
+
+def test_every_second_frame(sequence):
+    dataset = SevenScenes(sequence, stride=2)
+    assert len(dataset) == 2
+    assert [frame.stamp_ns for frame in dataset] == [frame.stamp_ns for frame in SevenScenes(sequence)][::2]
 
 
 @pytest.mark.parametrize("content", ["", "1 2 3", "585 0 320\n0 -585 240\n0 0 1", "585 0 inf\n0 585 240\n0 0 1"])

@@ -1,0 +1,101 @@
+"""RADIO checkpoints with random weights, written as its authors publish theirs, and text towers to go with them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from fus3dmaps_core.encoders.radio.checkout import import_from
+from fus3dmaps_core.encoders.radio.naradio import NARADIO
+from fus3dmaps_core.encoders.radio.pair import RadioPair
+from fus3dmaps_core.encoders.radio.published import REVISION
+from fus3dmaps_core.encoders.radio.radseg import RADSEG
+
+STAND_IN = Path(__file__).parent / "models" / "radio" / "stand_in"
+TEACHERS = {
+    "naradio": (("clip", "open_clip"), ("siglip", "open_clip"), ("dino_v2", "dino"), ("sam", "sam")),
+    "radseg": (("clip", "open_clip"), ("siglip2", "siglip2"), ("dino_v2", "dino"), ("sam", "sam")),
+}
+PAIRS = {"naradio": NARADIO, "radseg": RADSEG}
+WORDS = "a an the of in red blue photo square cup game video"
+
+
+def find_checkout() -> Path:
+    """RADIO's own code where this machine has it, and a stand-in of the same classes otherwise."""
+    named = os.environ.get("FUS3DMAPS_RADIO_CHECKOUT")
+    candidates = [Path(named)] if named else [Path(torch.hub.get_dir()) / f"NVlabs_RADIO_{REVISION}"]
+    return next((path for path in candidates if (path / "hubconf.py").is_file()), STAND_IN)
+
+
+def options(name: str, model: str, **model_options) -> argparse.Namespace:
+    """What a checkpoint says about the networks in it, as far as their construction asks for it."""
+    return argparse.Namespace(
+        model=model,
+        model_kwargs=model_options,
+        in_chans=None,
+        input_size=None,
+        pretrained=False,
+        num_classes=0,
+        drop=0.0,
+        drop_path=None,
+        drop_block=None,
+        gp=None,
+        bn_momentum=None,
+        bn_eps=None,
+        torchscript=False,
+        initial_checkpoint="",
+        cpe_max_size=2048,
+        teachers=[{"name": teacher, "type": kind, "use_summary": teacher != "sam"} for teacher, kind in TEACHERS[name]],
+        cls_token_per_teacher=True,
+        register_multiple=8,
+        mlp_version="v2",
+        spectral_reparam=False,
+        spectral_heads=False,
+    )
+
+
+def write_checkpoint(path: Path, checkout: Path, name: str, hidden: int, inner: int, model: str, **model_options) -> Path:
+    """A checkpoint with random weights for the pair of this name."""
+    described = options(name, model, **model_options)
+    build = import_from(checkout, "radio.radio_model", name).create_model_from_args
+    network = build(argparse.Namespace(**{**vars(described), "model_kwargs": dict(model_options)}))
+    factory = import_from(checkout, "radio.adaptor_module_factory", name)
+    state = {f"base_model.{key}": value for key, value in network.state_dict().items()}
+    for index, _ in enumerate(described.teachers):
+        # Every teacher's head has the pair's width, so that taking the wrong one is not found by its shape alone.
+        head = factory.create_mlp_from_config("v2", network.embed_dim, hidden, PAIRS[name].dimension, inner)
+        state |= {f"_heads.{index}.{key}": value for key, value in head.state_dict().items()}
+    state["input_conditioner.norm_mean"] = torch.tensor([0.48145466, 0.4578275, 0.40821073]).reshape(3, 1, 1)
+    state["input_conditioner.norm_std"] = torch.tensor([0.26862954, 0.26130258, 0.27577711]).reshape(3, 1, 1)
+    torch.save({"state_dict": state, "args": described}, path)
+    return path
+
+
+def small_text_pair(name: str) -> RadioPair:
+    """The pair with a narrow text tower of the same class."""
+    pair = PAIRS[name]
+    return replace(pair, text=replace(pair.text, vocabulary=100, width=32, hidden=64, layers=2, heads=2))
+
+
+def write_text(folder: Path, pair: RadioPair) -> torch.nn.Module:
+    """Files of the pair's text tower with random weights, and of a tokenizer with a few words; returns the tower."""
+    from safetensors.torch import save_file
+    from tokenizers import Tokenizer, models, pre_tokenizers
+
+    from fus3dmaps_core.encoders.radio.text import build_tower
+
+    tower = build_tower(pair.text, pair.name).to_empty(device="cpu")
+    for weight in tower.parameters():
+        torch.nn.init.normal_(weight, std=0.2)
+    others = {"logit_scale": torch.zeros(1), "vision_model.post_layernorm.weight": torch.ones(4)}
+    state = {f"text_model.{key.removeprefix('text_model.')}": value for key, value in tower.state_dict().items()}
+    save_file(state | others, folder / "model.safetensors")
+    words = {word: place for place, word in enumerate(["<pad>", "<eos>", "<unk>", *WORDS.split()])}
+    tokenizer = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
+    tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
+    tokenizer.save(str(folder / "tokenizer.json"))
+    return tower
