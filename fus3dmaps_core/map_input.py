@@ -142,3 +142,15 @@ def _tensor(values: NDArray[np.floating], device: torch.device) -> Tensor:
     """The values in a type that torch and kernels know."""
     wide = values if values.dtype in (np.float32, np.float64) else values.astype(np.float64)
     return torch.from_numpy(np.ascontiguousarray(wide)).to(device)
+
+
+def with_visible(
+    keys: Tensor, visible_points_m: NDArray[np.floating] | None, voxel_size_m: float, kernels: Kernels, device: torch.device
+) -> Tensor:
+    """Distinct keys of all voxels that a keyframe saw: those of its proposals, and of the points beside them."""
+    if visible_points_m is not None:
+        try:
+            keys = torch.cat([keys, voxel_keys(visible_points_m, voxel_size_m, kernels, device)])
+        except MapError as error:
+            raise MapError(f"visible_{error}") from None  # It speaks of points_m.
+    return kernels.distinct(keys)[0]

@@ -23,7 +23,15 @@ from fus3dmaps_core.kernels.protocols import Pairs, Texts
 from fus3dmaps_core.kernels.selection import select_kernels
 from fus3dmaps_core.layers.fusion import FusionInputs
 from fus3dmaps_core.layers.similarity import layer_named
-from fus3dmaps_core.map_input import check_state, float_tensor, index_tensor, unit_rows, voxel_keys, weight_tensor
+from fus3dmaps_core.map_input import (
+    check_state,
+    float_tensor,
+    index_tensor,
+    unit_rows,
+    voxel_keys,
+    weight_tensor,
+    with_visible,
+)
 from fus3dmaps_core.map_state import MapState
 from fus3dmaps_core.memory_budget import KeyframeBound, MemoryUse
 from fus3dmaps_core.search import Finding, Labelling, LayerOf, Question, Survey, unit_texts
@@ -174,7 +182,9 @@ class SemanticMap:
         keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
         unit = self._unit_rows("embeddings", embeddings)
         proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
-        visible_keys = self._visible_keys(keys, visible_points_m)
+        visible_keys = None
+        if self.config.association == "visible_iou":
+            visible_keys = with_visible(keys, visible_points_m, self.config.voxel_size_m, self._kernels, self._device)
         if not len(keys):
             return np.full(len(embeddings), -1, np.int64)
         keys, voxels, _ = self._kernels.distinct(keys)
@@ -390,18 +400,6 @@ class SemanticMap:
         fresh.fill(state)
         with self._lock:
             self._state = fresh
-
-    def _visible_keys(self, keys: Tensor, visible_points_m: NDArray[np.floating] | None) -> Tensor | None:
-        """Distinct keys of what a keyframe saw, its proposals' included; None where association does not ask."""
-        if self.config.association != "visible_iou":
-            return None
-        if visible_points_m is not None:
-            try:
-                seen = voxel_keys(visible_points_m, self.config.voxel_size_m, self._kernels, self._device)
-            except MapError as error:
-                raise MapError(f"visible_{error}") from None  # It speaks of points_m.
-            keys = torch.cat([keys, seen])
-        return self._kernels.distinct(keys)[0]
 
     def _unit_rows(self, name: str, embeddings: NDArray[np.floating]) -> Tensor:
         return unit_rows(name, embeddings, self.dimension, self._kernels, self._device)

@@ -86,7 +86,7 @@ def test_the_network_is_given_normalised_pixels_once(loaded, rng):
     """What enters the first layer, for patches and crops; a conditioner that was lost or run twice shows here."""
     side = loaded.pair.crop_px
     rgb = picture(rng, side, side)
-    backbone = loaded.trio.patch._network.backbone
+    backbone = loaded.trio.patch.network.backbone
     seen: list[np.ndarray] = []
     hook = backbone._embed.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].numpy().copy()))
     try:
@@ -134,7 +134,7 @@ def test_a_changed_patch_changes_its_own_embedding_most(loaded, rng, row, column
 
 
 def test_a_batch_gives_what_single_images_give(loaded, rng):
-    network = loaded.trio.patch._network
+    network = loaded.trio.patch.network
     images = torch.from_numpy(rng.normal(size=(3, 3, 48, 80)).astype(np.float32))
     with torch.inference_mode():
         torch.testing.assert_close(network(images), torch.cat([network(image[None]) for image in images]), atol=1e-5, rtol=0)

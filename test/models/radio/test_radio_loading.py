@@ -18,6 +18,7 @@ from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
 from fus3dmaps_core.encoders.radio.pair import default_dtype, load_networks, load_trio
 from fus3dmaps_core.encoders.radio.published import REVISION
+from fus3dmaps_core.encoders.radio.radseg import RADSEG
 from fus3dmaps_core.encoders.registry import load_text_encoder, names
 from fus3dmaps_core.encoders.registry import load_trio as load_by_name
 from fus3dmaps_core.errors import EncoderError
@@ -135,7 +136,7 @@ def test_heads_named_after_their_teacher_are_found(loaded, content, checkout, tm
     (tmp_path / "RADIO").symlink_to(checkout, target_is_directory=True)
     _, head = load_networks(loaded.pair, str(tmp_path))
     features = torch.ones(1, loaded.radio.model.embed_dim)
-    torch.testing.assert_close(head(features), loaded.trio.patch._network.head(features))
+    torch.testing.assert_close(head(features), loaded.trio.patch.network.head(features))
 
 
 def test_all_teachers_may_share_one_summary_token(loaded, content, checkout, tmp_path):
@@ -147,7 +148,7 @@ def test_all_teachers_may_share_one_summary_token(loaded, content, checkout, tmp
     torch.save(content, tmp_path / loaded.pair.radio.file_name)
     (tmp_path / "RADIO").symlink_to(checkout, target_is_directory=True)
     assert load_networks(loaded.pair, str(tmp_path))[1].token == 0
-    assert loaded.trio.crop._network.head.token == 1
+    assert loaded.trio.crop.network.head.token == 1
 
 
 def test_another_width_than_the_pairs_is_refused(loaded, content, checkout, tmp_path):
@@ -192,15 +193,19 @@ def test_half_precision_is_for_gpus():
     assert default_dtype("cuda:0") is torch.bfloat16
 
 
-def test_the_published_transformer_runs_at_full_width(checkout, tmp_path, rng):
-    """RADIO v2.5-L's 24 blocks of width 1024 with SigLIP's head, random weights, a frame of 480x640."""
+@pytest.mark.parametrize(
+    ("pair", "model", "width", "parameters"),
+    [(NARADIO, "vit_large_patch16_224", 1024, 319_881_216), (RADSEG, "vit_base_patch16_224", 768, 98_233_344)],
+)
+def test_the_published_transformers_run_at_full_width(checkout, tmp_path, rng, pair, model, width, parameters):
+    """All blocks of RADIO v2.5-L and C-RADIO v3-B with their teachers' heads, random weights, a frame of 480x640."""
     torch.manual_seed(3)
     (tmp_path / "RADIO").symlink_to(checkout, target_is_directory=True)
-    write_checkpoint(tmp_path / NARADIO.radio.file_name, checkout, "naradio", 1520, 3, "vit_large_patch16_224")
-    backbone, head = load_networks(NARADIO, str(tmp_path))
-    (tmp_path / NARADIO.radio.file_name).unlink()
-    assert sum(parameter.numel() for parameter in backbone.parameters()) == 319_881_216
+    write_checkpoint(tmp_path / pair.radio.file_name, checkout, pair.name, 1520, 3, model)
+    backbone, head = load_networks(pair, str(tmp_path))
+    (tmp_path / pair.radio.file_name).unlink()
+    assert sum(parameter.numel() for parameter in backbone.parameters()) == parameters
     with torch.inference_mode():
         features = backbone.patches(torch.from_numpy(rng.normal(size=(1, 3, 480, 640)).astype(np.float32)))
-        assert features.shape == (1, 30, 40, 1024)
+        assert features.shape == (1, 30, 40, width)
         assert head(features).shape == (1, 30, 40, 1152)
