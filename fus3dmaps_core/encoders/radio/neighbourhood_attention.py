@@ -83,7 +83,7 @@ def gaussian_window(rows: int, columns: int, prefix_tokens: int, sigma_patches: 
     down = _gaussian(rows, sigma_patches)
     across = _gaussian(columns, sigma_patches)
     # The Gaussian of a squared distance is the product of those of its two parts: entry (row, column; row, column).
-    patches = torch.kron(down, across)
+    patches = (down[:, None, :, None] * across[None, :, None, :]).reshape(rows * columns, rows * columns)
     return functional.pad(patches, (prefix_tokens, 0, prefix_tokens, 0))
 
 
