@@ -131,7 +131,9 @@ def _headline(records: Sequence[Record]) -> Table:
     from fus3dmaps_core.evaluation.statistics import spread
 
     scenes = sorted({record.scene for record in records})
-    table = Table(title=f"{', '.join(scenes)}, without background classes", title_justify="left", box=SIMPLE_HEAD)
+    table = Table(
+        title=f"{', '.join(scenes)}, without background classes", title_justify="left", padding=(0, 1, 0, 0), box=SIMPLE_HEAD
+    )
     for heading in ("layer", "mode", *_HEADLINE):
         table.add_column(heading, no_wrap=True)
     for layer, mode in dict.fromkeys((record.layer, record.mode) for record in records):

@@ -26,11 +26,13 @@ SCENE = "simulated building"
 INSTANCE_LAYERS = ("instances", "fused_instances")
 """What a map with a sliding window holds of all that it saw; its dense layer holds the window alone."""
 
+_MERGING = {"map.merge_overlap": 0.5, "map.merge_cosine": -1.0}  # By overlap alone: embeddings of few crops are too noisy.
+
 ASSOCIATIONS: dict[str, dict[str, Any]] = {
     "IoU": {},
     "visible IoU": {"map.association": "visible_iou"},
-    "IoU + merging": {"map.merge_overlap": 0.5},
-    "visible IoU + merging": {"map.association": "visible_iou", "map.merge_overlap": 0.5},
+    "IoU + merging": _MERGING,
+    "visible IoU + merging": {"map.association": "visible_iou", **_MERGING},
 }
 """Ways to associate proposals with instances, as parameters that differ from the defaults."""
 
