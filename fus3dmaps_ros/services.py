@@ -16,13 +16,14 @@ from fus3dmaps_ros.timed_calls import Deadline, TimedCalls
 
 T = TypeVar("T")
 
-# The default keeps ten requests: of a hundred clients that ask at once, ninety would wait for ever.
-_QOS = QoSProfile(
+SERVICE_QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=1000,
     reliability=ReliabilityPolicy.RELIABLE,
     durability=DurabilityPolicy.VOLATILE,
 )
+"""The default keeps ten requests: of a hundred that come at once, ninety would wait for ever. Who sends many at once from
+one client needs it there, too, for requests that wait to be taken and replies."""
 
 
 class Call:
@@ -79,7 +80,7 @@ class ServiceGroup:
                 service_type,
                 f"~/{name}",
                 reply,
-                qos_profile=_QOS,
+                qos_profile=SERVICE_QOS,
                 callback_group=MutuallyExclusiveCallbackGroup(),
             )
         )

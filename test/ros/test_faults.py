@@ -31,6 +31,7 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.map_directory import map_path
 from fus3dmaps_core.storage import load_map
 from fus3dmaps_msgs.srv import QueryText, SaveMap
+from fus3dmaps_ros.services import SERVICE_QOS
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
@@ -284,7 +285,8 @@ def test_odd_prompts_are_answered_or_refused(mapped_robot, prompt: str, success:
 
 def test_a_hundred_queries_at_once_are_all_answered(robot) -> None:
     robot.map(wall_frame(START_NS))
-    client = robot.user.create_client(QueryText, "fus3dmaps/query_text")
+    # With the default, the user's own side would keep ten requests and ten replies.
+    client = robot.user.create_client(QueryText, "fus3dmaps/query_text", qos_profile=SERVICE_QOS)
     assert client.wait_for_service(TIMEOUT_S)
     futures = [client.call_async(QueryText.Request(prompts=["red"])) for _ in range(100)]
     wait_until(lambda: all(future.done() for future in futures), "100 replies")
