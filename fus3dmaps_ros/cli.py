@@ -35,6 +35,7 @@ _out = Console(highlight=False)
 
 ParamsFile = Annotated[Path | None, typer.Option("--params-file", help="YAML file of parameters, as for the node.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="A parameter, e.g. map.voxel_size_m=0.1; repeatable.")]
+DatasetOptions = Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11; repeatable.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 
 
@@ -55,12 +56,15 @@ def convert(
     directory: Annotated[Path, typer.Argument(help="The dataset's folder.")],
     out: Annotated[Path, typer.Argument(help="Recording to write, ending in .mcap.")],
     overwrite: Overwrite = False,
+    options: DatasetOptions = None,
 ) -> None:
     """Turn a dataset into a rosbag2 MCAP recording."""
     from fus3dmaps_core.sources.convert import convert as convert_dataset
 
     with _progress("writing frames") as update:
-        summary = convert_dataset(dataset, directory, out, overwrite=overwrite, on_progress=update)
+        summary = convert_dataset(
+            dataset, directory, out, overwrite=overwrite, on_progress=update, options=_pairs("--option", options)
+        )
     _out.print(
         f"{out}: {summary.frames} frames, {summary.duration_s:.1f} s of recording, {summary.size_bytes / 1e6:.0f} MB",
         markup=False,
@@ -260,7 +264,7 @@ def evaluate(
     jobs: Annotated[int, typer.Option("--jobs", min=0, help="Buildings at once; 0: one for each processor.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write a JSON list of records to this file.")] = None,
     report: Annotated[Path | None, typer.Option("--report", help="Write tables and plots into this directory.")] = None,
-    options: Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11.")] = None,
+    options: DatasetOptions = None,
     params_file: ParamsFile = None,
     settings: Settings = None,
 ) -> None:

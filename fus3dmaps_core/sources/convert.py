@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def convert(
     *,
     overwrite: bool = False,
     on_progress: Callable[[int, int], None] | None = None,
-    **options: object,
+    options: Mapping[str, object] | None = None,
 ) -> ConversionSummary:
     """Write a dataset as a rosbag2 recording.
 
@@ -51,7 +51,7 @@ def convert(
         RecordingError: The dataset cannot be read or the recording not be written; the message names the file.
         ConfigError: An option is unknown or of the wrong type.
     """
-    dataset = open_dataset(layout, directory, **options)
+    dataset = open_dataset(layout, directory, **(options or {}))
     total = len(dataset)
     first_ns = last_ns = 0
     with RecordingWriter(out, config, overwrite=overwrite) as writer:

@@ -150,6 +150,7 @@ def test_refusals_are_one_line_that_names_what_is_wrong(run: Run, recording: Pat
     refused(run("map", recording, "--out", tmp_path / "m", "--set", "encoder.name=clippy"), "encoder.name", "clippy")
     refused(run("convert", "kitti", tmp_path, tmp_path / "k.mcap"), "kitti")
     refused(run("convert", "sevenscenes", tmp_path / "no_folder", tmp_path / "k.mcap"), "no_folder")
+    refused(run("convert", "sevenscenes", tmp_path, tmp_path / "k.mcap", "--option", "speed=2"), "speed")
     refused(run("simulate", tmp_path / "room.bag"), "room.bag")
     (tmp_path / "text.mcap").write_text("this is no recording")
     refused(run("map", tmp_path / "text.mcap", "--out", tmp_path / "m"), "text.mcap")

@@ -43,7 +43,7 @@ def test_an_unknown_layout_is_named(sequence, tmp_path):
 
 def test_options_reach_the_dataset(sequence, tmp_path):
     out = tmp_path / "out.mcap"
-    assert convert("sevenscenes", sequence.parent, out, scene="seq-01", stride=2).frames == 2
+    assert convert("sevenscenes", sequence.parent, out, options={"scene": "seq-01", "stride": 2}).frames == 2
 
 
 def test_a_failed_conversion_leaves_no_file(sequence, tmp_path):
