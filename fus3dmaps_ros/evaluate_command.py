@@ -21,11 +21,6 @@ from fus3dmaps_core.evaluation.records import CurvePoint, Record
 SIMULATION = "simulation"
 _HEADLINE = ("mIoU", "f-mIoU", "accuracy")
 
-SIMULATION_NOTES = {
-    "encoders": "simulated",
-}
-"""What the report says of a simulation beside its numbers."""
-
 Progress = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 """Shows a bar with this label."""
 
@@ -90,7 +85,7 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
         raise ConfigError("--report: plots need matplotlib; install the extra: pip install 'fus3dmaps_ros[evaluation]'")
     if request.directory is None:
         records, points = _simulate(request, destination.report is not None, progress)
-        notes = dict(SIMULATION_NOTES)
+        notes = {"encoders": "simulated"}
     else:
         records, points = _map_dataset(request, request.directory, config, progress), []
         notes = {"encoders": f"{config.encoder.name}, segmenter {config.segmenter.name}"}

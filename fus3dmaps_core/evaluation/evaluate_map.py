@@ -35,6 +35,8 @@ from fus3dmaps_core.evaluation.segmentation_metrics import ClassSubset, score_se
 from fus3dmaps_core.semantic_map import SemanticMap
 
 INSTANCE_LAYERS = ("instances", "fused_instances")
+"""What a map with a sliding window holds of all that it saw; its dense layer holds the window alone."""
+
 PRECISION_AT = (1, 3, 5)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fus3dmaps_core.evaluation.building_runs import BuildingRun, Variant
-from fus3dmaps_core.evaluation.evaluate_map import evaluate_map
+from fus3dmaps_core.evaluation.evaluate_map import INSTANCE_LAYERS, evaluate_map
 from fus3dmaps_core.evaluation.ground_truth import voxel_truth
 from fus3dmaps_core.evaluation.records import LAYERS, MODES, CurvePoint, Record
 from fus3dmaps_core.pipeline import Pipeline
@@ -23,9 +23,6 @@ from fus3dmaps_core.simulation.simulated_segmenter import SegmenterStatistics
 from fus3dmaps_core.sources.simulated_building import SimulatedBuilding
 
 SCENE = "simulated building"
-INSTANCE_LAYERS = ("instances", "fused_instances")
-"""What a map with a sliding window holds of all that it saw; its dense layer holds the window alone."""
-
 _MERGING = {"map.merge_overlap": 0.5, "map.merge_cosine": -1.0}  # By overlap alone: embeddings of few crops are too noisy.
 
 ASSOCIATIONS: dict[str, dict[str, Any]] = {

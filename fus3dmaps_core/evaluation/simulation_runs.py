@@ -44,7 +44,7 @@ def study_seeds(
     Returns:
         Records and points of curves, in the order of seeds.
     """
-    results = _each(_study, [(study, seed) for seed in seeds], jobs, on_progress)
+    results = _each(study_building, [(study, seed) for seed in seeds], jobs, on_progress)
     return [each for records, _ in results for each in records], [each for _, points in results for each in points]
 
 
@@ -59,15 +59,9 @@ def memory_of(
         jobs: As in :func:`study_seeds`.
         on_progress: As there.
     """
-    return [point for points in _each(_memory, [(study, seed) for seed in seeds], jobs, on_progress) for point in points]
-
-
-def _study(study: Study, seed: int, on_progress: Progress) -> tuple[list[Record], list[CurvePoint]]:
-    return study_building(study, seed, on_progress)
-
-
-def _memory(study: MemoryStudy, seed: int, on_progress: Progress) -> list[CurvePoint]:
-    return memory_curves(study, seed, on_progress)
+    return [
+        point for points in _each(memory_curves, [(study, seed) for seed in seeds], jobs, on_progress) for point in points
+    ]
 
 
 def _each(

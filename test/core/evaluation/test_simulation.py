@@ -10,9 +10,10 @@ import pytest
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.evaluation.building_runs import BuildingRun, Variant
+from fus3dmaps_core.evaluation.evaluate_map import INSTANCE_LAYERS
 from fus3dmaps_core.evaluation.memory_study import MemoryStudy, bytes_per_voxel, memory_curves
 from fus3dmaps_core.evaluation.records import LAYERS, MODES
-from fus3dmaps_core.evaluation.simulation import ASSOCIATIONS, INSTANCE_LAYERS, Study, study_building, with_noise_ratio
+from fus3dmaps_core.evaluation.simulation import ASSOCIATIONS, Study, study_building, with_noise_ratio
 from fus3dmaps_core.evaluation.simulation_runs import study_seeds
 from fus3dmaps_core.simulation.encoder_statistics import EncoderStatistics
 from fus3dmaps_core.sources.simulated_building import SimulatedBuilding
