@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.encoders.batching import Batches, naming_out_of_memory
-from fus3dmaps_core.encoders.protocols import EncoderTrio
+from fus3dmaps_core.encoders.mask_pooling import pool_masks
+from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.motion import KeyframeGate
@@ -70,14 +71,14 @@ class Pipeline:
     """
 
     def __init__(self, config: Config, trio: EncoderTrio, segmenter: Segmenter) -> None:
-        """Start with an empty map; ``fusion.variance_ratio`` of 0 takes the trio's own."""
+        """Start with an empty map; ``fusion.variance_ratio`` of 0 takes that of the encoders that describe it."""
         self.config = config
         self.trio = trio
         self._segmenter = segmenter
         self.semantic_map = SemanticMap(
             trio.dimension,
             config.map,
-            config.fusion.variance_ratio or trio.variance_ratio,
+            _variance_ratio(config, trio),
             config.fusion.window_radius_m,
             config.fusion.keep_most_evidence,
         )
@@ -102,7 +103,9 @@ class Pipeline:
         Raises:
             EncoderError: One of them is unknown, or its packages or weights are missing or altered.
         """
-        segmenter = load_segmenter(config.segmenter.name, config.encoder.device)
+        segmenter = load_segmenter(
+            config.segmenter.name, config.encoder.device, config.segmenter.weights, config.encoder.runtime
+        )
         encoder = config.encoder
         trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
         warm_up(trio.dimension, config.map)
@@ -132,11 +135,13 @@ class Pipeline:
             with report.timed("memory"):
                 report.dropped_dense_voxels = self._budget.make_room(self.semantic_map, T[:3, 3])
                 report.window_radius_m = self.semantic_map.window_radius_m
+        patches: PatchEmbeddings | None = None
         if report.dense:
-            self._integrate_dense(working, T, report)
+            patches = self._encode_patches(working, report)
+            self._integrate_dense(working, patches, T, report)
             self._dense_gate.accept(T)
         if report.instances:
-            self._integrate_instances(working, T, report)
+            self._integrate_instances(working, patches, T, report)
             self._instance_gate.accept(T)
         self._processed += 1
         self.stamp_ns = frame.stamp_ns
@@ -161,9 +166,13 @@ class Pipeline:
         """Poses T_world_camera of the keyframes so far: (n, 4, 4)."""
         return np.array(list(self._camera_poses), dtype=np.float64).reshape(-1, 4, 4)
 
-    def _integrate_dense(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
+    def _encode_patches(self, working: WorkingFrame, report: FrameReport) -> PatchEmbeddings:
         with report.timed("patch_encoder"), naming_out_of_memory(f"patch encoder of '{self.trio.name}'"):
-            patches = self.trio.patch.encode_patches(working.rgb)
+            return self.trio.patch.encode_patches(working.rgb)
+
+    def _integrate_dense(
+        self, working: WorkingFrame, patches: PatchEmbeddings, T: NDArray[np.float64], report: FrameReport
+    ) -> None:
         with report.timed("dense_update"):
             rows, columns, dimension = patches.embeddings.shape
             height, width = working.depth_m.shape
@@ -178,21 +187,34 @@ class Pipeline:
                 working.rgb[ys, xs],
             )
 
-    def _integrate_instances(self, working: WorkingFrame, T: NDArray[np.float64], report: FrameReport) -> None:
+    def _integrate_instances(
+        self, working: WorkingFrame, patches: PatchEmbeddings | None, T: NDArray[np.float64], report: FrameReport
+    ) -> None:
         with report.timed("segmentation"), naming_out_of_memory(f"segmenter '{self.config.segmenter.name}'"):
             masks = filter_masks(self._segmenter.segment(working.rgb, working.depth_m), self.config.segmenter)
             proposals, samples, ys, xs, masks = self._proposal_samples(working, masks)
         if not len(masks):
             return
-        with report.timed("crop_encoder"):
-            embeddings = self._crop_batches.run(
-                lambda rows: self.trio.crop.encode_crops(working.rgb, Masks(masks.masks[rows], masks.boxes[rows])),
-                len(masks),
-            )
+        embeddings = self._describe(working, masks, patches, report)
         with report.timed("instance_update"):
             visible = unproject(working.depth_m, ys, xs, working.intrinsics, T)
             self.semantic_map.integrate_proposals(visible.take(samples, axis=0), proposals, embeddings, visible)
         report.proposals = len(masks)
+
+    def _describe(
+        self, working: WorkingFrame, masks: Masks, patches: PatchEmbeddings | None, report: FrameReport
+    ) -> NDArray[np.float32]:
+        """Embed masks by their crops, or by the patches of the frame, which the dense layer has had embedded or not."""
+        if self.config.encoder.instance_embeddings == "patches":
+            if patches is None:
+                patches = self._encode_patches(working, report)
+            with report.timed("mask_pooling"):
+                return pool_masks(patches, masks)
+        with report.timed("crop_encoder"):
+            return self._crop_batches.run(
+                lambda rows: self.trio.crop.encode_crops(working.rgb, Masks(masks.masks[rows], masks.boxes[rows])),
+                len(masks),
+            )
 
     def _proposal_samples(
         self, working: WorkingFrame, masks: Masks
@@ -218,7 +240,7 @@ class Pipeline:
         return SemanticMap(
             self.trio.dimension,
             self.config.map,
-            self.config.fusion.variance_ratio or self.trio.variance_ratio,
+            _variance_ratio(self.config, self.trio),
             self.config.fusion.window_radius_m,
             self.config.fusion.keep_most_evidence,
         )
@@ -261,6 +283,12 @@ class Pipeline:
         )
         if not config.map.memory_budget_mib and config.fusion.window_radius_m > 0:
             self.semantic_map.set_window_radius(config.fusion.window_radius_m)  # Nothing else would widen it again.
+
+
+def _variance_ratio(config: Config, trio: EncoderTrio) -> float:
+    """Lambda as configured, or that of the encoders; where one encoder describes both layers, its errors are the same."""
+    of_encoders = 1.0 if config.encoder.instance_embeddings == "patches" else trio.variance_ratio
+    return config.fusion.variance_ratio or of_encoders
 
 
 def _keyframe_bound(config: Config, trio: EncoderTrio) -> KeyframeBound:

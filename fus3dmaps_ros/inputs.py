@@ -15,7 +15,8 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fus3dmaps_core.config import Config, QosProfile
+from fus3dmaps_core.config import Config
+from fus3dmaps_core.input_config import QosProfile
 from fus3dmaps_core.messages import stamp_ns
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
 from fus3dmaps_core.sources.streams import InputStream, uses_tf

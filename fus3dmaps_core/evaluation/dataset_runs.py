@@ -49,7 +49,9 @@ def evaluate_dataset(
     }
     encoder = config.encoder
     trio = shared_trio(load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights))
-    segmenter = shared_segmenter(load_segmenter(config.segmenter.name, config.encoder.device))
+    segmenter = shared_segmenter(
+        load_segmenter(config.segmenter.name, encoder.device, config.segmenter.weights, encoder.runtime)
+    )
     pipelines = {mode: Pipeline(config.with_values(settings[mode]), trio, segmenter) for mode in MODES}
     for done, frame in enumerate(dataset, start=1):
         working = _at_working_resolution(frame, config)

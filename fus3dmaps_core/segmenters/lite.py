@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
 
+from fus3dmaps_core.config import Runtime
 from fus3dmaps_core.encoders.lite.detector import Detections, Detector, shared_detector
 from fus3dmaps_core.encoders.lite.evidence import box_iou
+from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.coplanar import join_coplanar
 
@@ -29,12 +31,16 @@ _DEPTH_STEP = 1.2  # Ratio of mean depths from which a box shows a thing and som
 _SAME_IOU = 0.85
 
 
-def load(device: str) -> LiteSegmenter:
-    """Load the segmenter, which runs on the CPU whatever the device.
+def load(device: str, weights: str, runtime: Runtime) -> LiteSegmenter:
+    """Load the segmenter, which runs on the CPU whatever the device and the runtime.
 
     Raises:
-        EncoderError: The detector's package is missing or altered.
+        EncoderError: Weights are asked for, of which it has none, or the detector's package is missing or altered.
     """
+    if weights:
+        raise EncoderError(
+            f"parameter 'segmenter.weights': segmenter 'lite' has no weights but those of its pip package, got '{weights}'"
+        )
     return LiteSegmenter(shared_detector())
 
 

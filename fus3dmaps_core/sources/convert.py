@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from fus3dmaps_core.config import InputConfig
 from fus3dmaps_core.datasets.registry import open_dataset
+from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.recordings.writer import RecordingWriter
 
 

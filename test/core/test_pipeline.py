@@ -136,6 +136,44 @@ def instances_of_a_bar(association: str, in_view: bool) -> int:
     return pipeline.semantic_map.instance_count
 
 
+def test_masks_described_by_patches_cost_no_second_encoder():
+    pipeline = make(encoder__instance_embeddings="patches")
+    crops = pipeline.trio.crop
+    assert crops is pipeline.trio.patch
+    crops.encode_crops = None  # Any call would fail.
+    reports = [pipeline.process(wall_frame(i, x_m=0.1 * i - 0.25)) for i in range(6)]
+    assert pipeline.trio.patch.images == sum(report.dense or report.instances for report in reports)
+    assert sum(report.proposals for report in reports) > 0
+    assert "crop_encoder" not in set().union(*(report.durations_s for report in reports))
+    for prompt, x_m in (("red", -0.4), ("blue", 0.5)):
+        for layer in ("instances", "fused_instances"):
+            assert ask(pipeline, prompt, layer).instances[0].centroid_m[0] == pytest.approx(x_m, abs=0.05)
+
+
+def test_patches_that_the_dense_layer_does_not_need_are_embedded_for_instances():
+    pipeline = make(
+        encoder__instance_embeddings="patches", keyframes__dense_translation_m=9.0, keyframes__dense_rotation_rad=9.0
+    )
+    reports = [pipeline.process(wall_frame(i, x_m=0.2 * i)) for i in range(3)]
+    assert [report.dense for report in reports] == [True, False, False]
+    assert all(report.proposals for report in reports)
+    assert pipeline.trio.patch.images == 3
+
+
+def test_lambda_is_the_encoders_unless_it_is_set_or_patches_describe_masks():
+    trio = replace(color_trio(), variance_ratio=5.0)
+
+    def ratio(**values) -> float:
+        config = Config.from_flat({key.replace("__", "."): value for key, value in values.items()})
+        pipeline = Pipeline(config, trio, ColorSegmenter())
+        assert pipeline.empty_map().variance_ratio == pipeline.semantic_map.variance_ratio
+        return pipeline.semantic_map.variance_ratio
+
+    assert ratio() == 5.0
+    assert ratio(encoder__instance_embeddings="patches") == 1.0
+    assert ratio(encoder__instance_embeddings="patches", fusion__variance_ratio=0.3) == 0.3
+
+
 def test_a_window_that_keeps_no_evidence_is_the_configurations_choice():
     evidence = {}
     for keep in (True, False):

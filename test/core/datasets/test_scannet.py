@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from plane_scene import assert_on_wall, colors, cut, pose, wall_depth_m, write_color, write_gray
 
-from fus3dmaps_core.config import ImageConfig, InputConfig
+from fus3dmaps_core.config import ImageConfig
 from fus3dmaps_core.datasets.registry import open_labelled
 from fus3dmaps_core.datasets.scannet import ScanNet
 from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import Intrinsics
+from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.sources.bag import BagSource
 from fus3dmaps_core.sources.convert import convert
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from recorded_frames import assert_same_frames, noise_frames, write_sevenscenes
 
-from fus3dmaps_core.config import ImageConfig, InputConfig
+from fus3dmaps_core.config import ImageConfig
 from fus3dmaps_core.datasets.registry import open_dataset
 from fus3dmaps_core.errors import RecordingError
+from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.sources.bag import BagSource
 from fus3dmaps_core.sources.convert import convert
 
