@@ -6,9 +6,10 @@ import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -19,6 +20,17 @@ from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.evaluation.records import CurvePoint, Record
 
 SIMULATION = "simulation"
+_SIMULATED = (
+    "encoder.instance_embeddings",
+    "segmenter.min_area_px",
+    "segmenter.max_border_contact",
+    "segmenter.max_masks",
+    "keyframes.",
+    "sampling.",
+    "map.",
+    "fusion.",
+)
+"""Keys, or their beginnings, that mean something to simulated buildings."""
 _HEADLINE = ("mIoU", "f-mIoU", "accuracy")
 
 Progress = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
@@ -66,12 +78,13 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
 
     Args:
         request: What is evaluated.
-        config: For mapping a dataset.
+        config: Of the maps; simulated buildings come with models, images and topics of their own.
         destination: Where the results go.
         progress: Shows how far it is.
 
     Raises:
-        ConfigError: A dataset has no directory, the simulation has one, or the plots' package is missing.
+        ConfigError: A dataset has no directory, the simulation has one or is given a parameter that means nothing to it, or
+            the plots' package is missing.
         StorageError: A file cannot be written.
     """
     from fus3dmaps_core.evaluation.records import write_records
@@ -84,7 +97,7 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
     if destination.report is not None and find_spec("matplotlib") is None:
         raise ConfigError("--report: plots need matplotlib; install the extra: pip install 'fus3dmaps_ros[evaluation]'")
     if request.directory is None:
-        records, points = _simulate(request, destination.report is not None, progress)
+        records, points = _simulate(request, _of_maps(config), destination.report is not None, progress)
         notes = {"encoders": "simulated"}
     else:
         records, points = _map_dataset(request, request.directory, config, progress), []
@@ -100,11 +113,24 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
         destination.console.print(f"report: {page}", markup=False, soft_wrap=True)
 
 
-def _simulate(request: Evaluation, with_sweeps: bool, progress: Progress) -> tuple[list[Record], list[CurvePoint]]:
+def _of_maps(config: Config) -> dict[str, Any]:
+    """What of a configuration is not its default and says how a simulated building is mapped."""
+    defaults = Config().flat()
+    changed = {key: value for key, value in config.flat().items() if value != defaults[key]}
+    for key in changed:
+        if not key.startswith(_SIMULATED):
+            raise ConfigError(f"evaluate simulation: parameter '{key}' has no effect on simulated buildings")
+    return changed
+
+
+def _simulate(
+    request: Evaluation, settings: Mapping[str, Any], with_sweeps: bool, progress: Progress
+) -> tuple[list[Record], list[CurvePoint]]:
     from fus3dmaps_core.evaluation import simulation_runs as runs
     from fus3dmaps_core.evaluation.memory_study import MemoryStudy
 
     study = runs.QUICK if request.quick else runs.WHOLE if with_sweeps else runs.MODES_ONLY
+    study = replace(study, settings=settings)
     with progress("studying buildings") as update:
         records, points = runs.study_seeds(study, range(request.seeds), request.jobs, update)
     if with_sweeps and not request.quick:

@@ -49,6 +49,7 @@ class Study:
         lambdas: Where a sweep evaluates.
         window_radii_m: Of the sweep over radii.
         associations: Parameters of each way to associate, by its name.
+        settings: Parameters of every map that differ from the defaults; what is compared goes before them.
     """
 
     storeys: int = 1
@@ -61,6 +62,7 @@ class Study:
     lambdas: tuple[float, ...] = (0.02, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
     window_radii_m: tuple[float, ...] = ()
     associations: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
 
 def study_building(
@@ -127,7 +129,7 @@ def _variants(study: Study) -> dict[str, Variant]:
         variants[_radius_name(radius_m)] = Variant({"fusion.window_radius_m": radius_m}, plain)
     for name, settings in study.associations.items():
         variants[name] = Variant({"fusion.window_radius_m": 0.0, **settings}, plain)
-    return variants
+    return {name: replace(each, settings={**study.settings, **each.settings}) for name, each in variants.items()}
 
 
 def _ratio_name(ratio: float) -> str:

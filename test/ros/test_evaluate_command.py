@@ -26,12 +26,17 @@ def no_bar(_: str) -> Iterator[object]:
 
 
 def run(
-    target: str, directory: Path | None = None, json_file: Path | None = None, report: Path | None = None, **options: str
+    target: str,
+    directory: Path | None = None,
+    json_file: Path | None = None,
+    report: Path | None = None,
+    settings: dict[str, object] | None = None,
+    **options: str,
 ) -> str:
     told = io.StringIO()
     console = Console(file=told, width=200)
     request = Evaluation(target, directory, 2, True, 2, options)
-    evaluate_target(request, Config(), Destination(json_file, report, console), no_bar)
+    evaluate_target(request, Config.from_flat(settings or {}), Destination(json_file, report, console), no_bar)
     return told.getvalue()
 
 
@@ -66,6 +71,28 @@ def test_a_simulation_is_tabled_and_written(monkeypatch, tmp_path) -> None:
 def test_what_cannot_be_evaluated_is_refused_by_name(target, directory, said) -> None:
     with pytest.raises(Fus3dmapsError, match=said):
         run(target, directory)
+
+
+def test_parameters_of_the_maps_reach_simulated_buildings(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(simulation_runs, "QUICK", Study(rooms_per_storey=1, frames=16))
+    scores = {}
+    for embeddings in ("crops", "patches"):
+        file = tmp_path / f"{embeddings}.json"
+        run("simulation", json_file=file, settings={"encoder.instance_embeddings": embeddings})
+        scores[embeddings] = {
+            (each["layer"], each["seed"]): each["value"]
+            for each in json.loads(file.read_text())
+            if (each["mode"], each["metric"]) == ("full", "accuracy")
+        }
+    for seed in (0, 1):
+        assert scores["crops"]["dense", seed] == scores["patches"]["dense", seed]
+        assert scores["crops"]["instances", seed] != scores["patches"]["instances", seed]
+
+
+@pytest.mark.parametrize("key", ["encoder.name", "input.rgb_topic"])
+def test_parameters_without_effect_on_simulated_buildings_are_refused_by_name(key) -> None:
+    with pytest.raises(ConfigError, match=f"'{key}' has no effect"):
+        run("simulation", settings={key: "something"})
 
 
 def test_an_option_that_the_dataset_does_not_know_is_refused(tmp_path) -> None:
