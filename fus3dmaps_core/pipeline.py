@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,13 @@ from fus3dmaps_core.encoders.batching import Batches, naming_out_of_memory
 from fus3dmaps_core.encoders.mask_pooling import pool_masks
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.encoders.registry import load_trio
+from fus3dmaps_core.encoders.text_cache import CachedTextEncoder
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.motion import KeyframeGate
 from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sample_pixels, unproject
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.memory_budget import KeyframeBound, MemoryBudget
+from fus3dmaps_core.runtimes.acceleration import accelerate
 from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
@@ -101,13 +103,16 @@ class Pipeline:
         """Load the encoders and the segmenter that the configuration names, and warm up the map.
 
         Raises:
-            EncoderError: One of them is unknown, or its packages or weights are missing or altered.
+            EncoderError: One of them is unknown, its packages or weights are missing or altered, or the runtime cannot be
+                used.
         """
         segmenter = load_segmenter(
             config.segmenter.name, config.encoder.device, config.segmenter.weights, config.encoder.runtime
         )
         encoder = config.encoder
         trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
+        trio = accelerate(trio, encoder, config.image)
+        trio = replace(trio, text=CachedTextEncoder(trio.text))
         warm_up(trio.dimension, config.map)
         return cls(config, trio, segmenter)
 

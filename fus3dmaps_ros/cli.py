@@ -276,6 +276,39 @@ def evaluate(
 
 
 @app.command()
+def encoders(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    weights: Annotated[str | None, typer.Option("--weights", help="Where weights are; the same as encoder.weights.")] = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """List the encoders: their space, their licences, and what of them is installed."""
+    from fus3dmaps_ros.encoders_command import list_encoders
+
+    config = _config(params_file, settings)
+    if weights is not None:
+        config = config.with_values({"encoder.weights": weights})
+    list_encoders(config, _out, as_json=as_json)
+
+
+@app.command()
+def export(
+    out: Annotated[Path, typer.Option("--out", help="Directory for graphs and engines; later encoder.graph_directory.")],
+    encoder: Annotated[str | None, typer.Option("--encoder", help="Which encoders; the same as encoder.name.")] = None,
+    precision: Annotated[str | None, typer.Option("--precision", help="fp32, fp16 or bf16; as encoder.precision.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Write the networks of encoders as checked ONNX files, and build TensorRT engines where TensorRT is installed."""
+    from fus3dmaps_ros.export_command import export_encoders
+
+    chosen = {"encoder.name": encoder, "encoder.precision": precision}
+    config = _config(params_file, settings).with_values({key: value for key, value in chosen.items() if value is not None})
+    export_encoders(config, out, _out, as_json=as_json)
+
+
+@app.command()
 def demo(
     recording: Annotated[Path | None, typer.Argument(help="Recording to use instead of the simulated room.")] = None,
     prompts: Annotated[list[str] | None, typer.Argument(metavar="PROMPT...", help="What to ask.")] = None,

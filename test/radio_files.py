@@ -86,7 +86,7 @@ def write_text(folder: Path, pair: RadioPair) -> torch.nn.Module:
     from safetensors.torch import save_file
     from tokenizers import Tokenizer, models, pre_tokenizers
 
-    from fus3dmaps_core.encoders.radio.text import build_tower
+    from fus3dmaps_core.encoders.siglip_text import build_tower
 
     tower = build_tower(pair.text, pair.name).to_empty(device="cpu")
     for weight in tower.parameters():

@@ -1,4 +1,7 @@
-"""Networks of encoders as graphs of fixed shape, for runtimes other than torch's own."""
+"""Networks of encoders as graphs of fixed shape, for runtimes other than torch's own.
+
+Images alone go through them. Text towers stay in torch: a prompt comes once in a while and is short.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +22,9 @@ class Graph:
 
     Attributes:
         name: ``patch`` or ``crop``; with the trio's name it names files.
-        network: On its device, in evaluation mode; takes one tensor and returns one, or a tuple.
-        shape: Of its input: (n, 3, H, W), float32 normalised images. Fewer than n images are padded by who runs it.
-        outputs: Names of its outputs, in order; the first are embeddings of unit length along the last axis.
+        network: On its device, in evaluation mode; takes one float32 tensor and returns one float32 tensor, or a tuple.
+        shape: Of its input: (n, 3, H, W), images as the encoder prepares them. Fewer than n are padded by who runs it.
+        outputs: Names of its outputs, in order; the first are embeddings along the last axis, or logits that become such.
     """
 
     name: str

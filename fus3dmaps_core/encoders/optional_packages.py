@@ -7,7 +7,7 @@ from types import ModuleType
 
 from fus3dmaps_core.errors import EncoderError
 
-EXTRA = "fus3dmaps[models]"
+EXTRA = "fus3dmaps_ros[models]"
 
 
 def import_optional(module: str, encoder: str) -> ModuleType:

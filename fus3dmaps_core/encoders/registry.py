@@ -7,6 +7,7 @@ from importlib import import_module
 from types import ModuleType
 from typing import cast
 
+from fus3dmaps_core.encoders.cards import EncoderCard
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
@@ -15,12 +16,22 @@ _TRIOS = {
     "lite": "fus3dmaps_core.encoders.lite",
     "naradio": "fus3dmaps_core.encoders.radio.naradio",
     "radseg": "fus3dmaps_core.encoders.radio.radseg",
+    "siglip2": "fus3dmaps_core.encoders.siglip2",
 }
 
 
 def names() -> list[str]:
     """Names of the known encoder trios."""
     return sorted(_TRIOS)
+
+
+def card(name: str) -> EncoderCard:
+    """What there is to know about a trio without loading it.
+
+    Raises:
+        EncoderError: The name is unknown.
+    """
+    return cast(EncoderCard, _module(name).CARD)
 
 
 def load_trio(name: str, device: str, crop_padding: float, weights: str = "") -> EncoderTrio:

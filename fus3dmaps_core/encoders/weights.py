@@ -13,7 +13,7 @@ Every refusal is one line that says what to download from where, and where to pu
 from __future__ import annotations
 
 import argparse
-import hashlib
+import http.client
 import logging
 import os
 import pickle
@@ -22,20 +22,23 @@ import socket
 import tempfile
 import urllib.parse
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from fus3dmaps_core.encoders.weight_content import TORCH_SUFFIXES, content_problem, hash_problem
 from fus3dmaps_core.errors import EncoderError
 
 _log = logging.getLogger(__name__)
 
 _HUB_NAME = re.compile(r"(?P<repo>[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*)(?:@(?P<revision>[\w./-]+))?")
-_SUFFIXES = (".safetensors", ".pt", ".pth", ".tar", ".bin", ".onnx", ".ckpt")
+_SUFFIXES = (".safetensors", *TORCH_SUFFIXES, ".onnx")
 _TIMEOUT_S = 20.0  # Of one read from the network, not of the whole download.
+_CONNECT_S = 5.0  # Until a host that does not answer counts as not reachable.
 _CHUNK_BYTES = 1 << 20
 _WRAPPERS = ("state_dict", "model_state_dict", "model")  # Under which training scripts store the weights.
 _NAMED = 3  # Names of a list that a message has.
@@ -88,7 +91,34 @@ def local_path(value: str) -> Path | None:
     try:
         path = Path(value).expanduser()
         return path if value and path.exists() else None
-    except (OSError, RuntimeError):  # A name too long, or the home of somebody unknown.
+    except (OSError, RuntimeError, ValueError):  # A name too long, the home of somebody unknown, or a byte of zero.
+        return None
+
+
+def is_hub_name(value: str) -> bool:
+    """Whether a value that names no file or directory can name a repository of the hub."""
+    return _as_hub_name(value) is not None
+
+
+def locate(value: str, file: WeightFile) -> Path | None:
+    """Path of a weight file that is on this machine already, without the network and without reading it.
+
+    Args:
+        value: Value of the parameter, see above.
+        file: Which file is looked for.
+
+    Returns:
+        What :func:`find_weights` would take without a download, if its content is right; None where there is no such file,
+        or an empty one, or it cannot be looked for.
+    """
+    try:
+        path = local_path(value)
+        if path is not None:
+            found = _in_directory(path, Path(file.file_name).name) if path.is_dir() else path
+            return found if _has_content(found) else None
+        repository = _repository(value, file)
+        return None if repository is None else _cached(*repository, file)
+    except OSError:
         return None
 
 
@@ -101,33 +131,62 @@ def find_weights(parameter: str, value: str, file: WeightFile) -> Path:
         file: Which file is needed.
 
     Raises:
-        EncoderError: There is no such file and it cannot be downloaded, or its hash is wrong; the message says what to
-            download from where and where to put it.
+        EncoderError: There is no such file and it cannot be downloaded, or it cannot be read, or its hash is wrong, or its
+            ends show that it is cut short or something else; the message says what to download from where and where to put
+            it.
     """
     refusal = f"parameter '{parameter}': {file.title}"
+    try:
+        path, is_published = _find(refusal, parameter, value, file)
+        is_known = is_published and (file.sha256 or file.git_blob)
+        problem = hash_problem(path, file.sha256, file.git_blob) if is_known else content_problem(path)
+    except OSError as error:
+        raise EncoderError(f"{refusal}: cannot be read: {_line(error)}; {_advice(parameter, file)}") from None
+    if problem:
+        raise EncoderError(f"{refusal}: '{path}' {problem}; {_advice(parameter, file)}")
+    return path
+
+
+def only_directory(value: str) -> str:
+    """The value of a parameter where it is a directory, which any file is looked for in, and "" where it is one file's."""
+    path = local_path(value)
+    return value if path is not None and path.is_dir() else ""
+
+
+@contextmanager
+def saying_what_to_get(parameter: str, file: WeightFile) -> Iterator[None]:
+    """Add to a refusal inside what to download from where, and where to put it.
+
+    Args:
+        parameter: Name of the parameter for messages.
+        file: Which file is needed.
+
+    Raises:
+        EncoderError: That refusal.
+    """
+    try:
+        yield
+    except EncoderError as error:
+        raise EncoderError(f"{error}; {_advice(parameter, file)}") from None
+
+
+def _find(refusal: str, parameter: str, value: str, file: WeightFile) -> tuple[Path, bool]:
+    """The file, and whether it is to be the published one, to the byte."""
     path = local_path(value)
     if path is not None:
-        found = _in_directory(path, Path(file.file_name).name) if path.is_dir() else path
-        if not found.is_file():
+        name = Path(file.file_name).name
+        found = _in_directory(path, name) if path.is_dir() else path
+        if path.is_dir() and not found.is_file():
             raise EncoderError(f"{refusal}: directory '{path}' has no '{found.name}'; {_advice(parameter, file)}")
-        if found.name == Path(file.file_name).name:
-            _check_hash(refusal, found, parameter, file)
-        return found
-    hub = _HUB_NAME.fullmatch(value)
-    if value and (hub is None or value.endswith(_SUFFIXES)):
+        if not found.is_file():
+            raise EncoderError(f"{refusal}: '{path}' is neither a file nor a directory; {_advice(parameter, file)}")
+        return found, found.name == name
+    repository = _repository(value, file)
+    if repository is None:
         raise EncoderError(f"{refusal}: there is no file or directory '{value}'; {_advice(parameter, file)}")
-    repository, revision = (hub["repo"], hub["revision"] or "") if hub else (file.hub, file.revision)
-    if repository == file.hub and not revision:
-        revision = file.revision
-    is_published = (repository, revision) == (file.hub, file.revision)
-    found_or_none = _cached_by_hub(repository, revision, file.file_name) if repository else None
-    if found_or_none is None and is_published and file.cached_path.is_file():
-        found_or_none = file.cached_path
-    if found_or_none is None:
-        found_or_none = _download(refusal, repository, revision, parameter, file, by_url=is_published)
-    if is_published:
-        _check_hash(refusal, found_or_none, parameter, file)
-    return found_or_none
+    is_published = repository == (file.hub, file.revision)
+    cached = _cached(*repository, file)
+    return cached or _download(refusal, *repository, parameter, file, by_url=is_published), is_published
 
 
 def read_state(path: Path) -> dict[str, torch.Tensor]:
@@ -140,6 +199,8 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
     Raises:
         EncoderError: The file cannot be read, holds Python objects other than tensors and plain values, or no tensors.
     """
+    if path.suffix == ".onnx":
+        raise EncoderError(f"weights '{path}': an ONNX graph; weights are read from safetensors or what torch.save wrote")
     try:
         if path.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -150,7 +211,7 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
             with torch.serialization.safe_globals([argparse.Namespace]):
                 content = torch.load(path, map_location="cpu", weights_only=True)
     except ImportError as error:
-        raise EncoderError(f"weights '{path}': '{error.name}' is not installed; use fus3dmaps[models]") from None
+        raise EncoderError(f"weights '{path}': '{error.name}' is not installed; use fus3dmaps_ros[models]") from None
     except pickle.UnpicklingError as error:
         raise EncoderError(
             f"weights '{path}': not a weight file, or one with Python objects in it, which are not loaded: {_line(error)}"
@@ -209,27 +270,36 @@ def _in_directory(directory: Path, name: str) -> Path:
     return next((path for path in candidates if path.is_file()), directory / name)
 
 
+def _as_hub_name(value: str) -> re.Match[str] | None:
+    match = None if value.endswith(_SUFFIXES) else _HUB_NAME.fullmatch(value)
+    return match if match and not re.search(r"--|\.\.", value) else None  # Which the hub has in no name.
+
+
+def _repository(value: str, file: WeightFile) -> tuple[str, str] | None:
+    """Repository and revision that a value without a file or directory stands for; None where it is no name of one."""
+    if not value:
+        return file.hub, file.revision
+    name = _as_hub_name(value)
+    if name is None:
+        return None
+    revision = name["revision"] or ""
+    return name["repo"], file.revision if name["repo"] == file.hub and not revision else revision
+
+
+def _cached(repository: str, revision: str, file: WeightFile) -> Path | None:
+    """The file in the cache of the hub's client, or in this package's own."""
+    found = _cached_by_hub(repository, revision, file.file_name) if repository else None
+    is_published = (repository, revision) == (file.hub, file.revision)
+    candidates = (*((found,) if found else ()), *((file.cached_path,) if is_published else ()))
+    return next((path for path in candidates if _has_content(path)), None)
+
+
+def _has_content(path: Path) -> bool:
+    return path.is_file() and path.stat().st_size > 0
+
+
 def _advice(parameter: str, file: WeightFile) -> str:
     return f"download {file.source} and put it at '{file.cached_path}', or set '{parameter}' to where it lies"
-
-
-def _check_hash(refusal: str, path: Path, parameter: str, file: WeightFile) -> None:
-    for kind, expected, prefix in (
-        ("sha256", file.sha256, b""),
-        ("sha1", file.git_blob, f"blob {path.stat().st_size}\0".encode()),  # Git hashes the size along.
-    ):
-        if not expected:
-            continue
-        digest = hashlib.new(kind, prefix)
-        with path.open("rb") as stream:
-            while chunk := stream.read(_CHUNK_BYTES):
-                digest.update(chunk)
-        if digest.hexdigest() != expected:
-            name = "git blob" if prefix else kind
-            raise EncoderError(
-                f"{refusal}: '{path}' is altered or incomplete, its {name} is {digest.hexdigest()}, not {expected}; "
-                f"{_advice(parameter, file)}"
-            )
 
 
 def _cached_by_hub(repository: str, revision: str, file_name: str) -> Path | None:
@@ -237,7 +307,10 @@ def _cached_by_hub(repository: str, revision: str, file_name: str) -> Path | Non
         from huggingface_hub import try_to_load_from_cache
     except ImportError:
         return None
-    path = try_to_load_from_cache(repository, file_name, revision=revision or None)
+    try:
+        path = try_to_load_from_cache(repository, file_name, revision=revision or None)
+    except ValueError:  # No name of a repository.
+        return None
     return Path(path) if isinstance(path, str) else None
 
 
@@ -248,7 +321,7 @@ def _download(refusal: str, repository: str, revision: str, parameter: str, file
         try:
             from huggingface_hub import constants, hf_hub_download
 
-            _check_reachable(constants.ENDPOINT)
+            check_reachable(constants.ENDPOINT)
             _log.info("downloading %s from huggingface.co/%s", file.file_name, repository)
             return Path(hf_hub_download(repository, file.file_name, revision=revision or None, etag_timeout=_TIMEOUT_S))
         except ImportError:
@@ -260,18 +333,26 @@ def _download(refusal: str, repository: str, revision: str, parameter: str, file
         try:
             _log.info("downloading %s", file.url)
             return _fetch(file.url, file.cached_path)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, http.client.HTTPException) as error:
             causes.append(_line(error))
     raise EncoderError(
         f"{refusal} is not on this machine and cannot be downloaded ({'; '.join(causes)}); {_advice(parameter, file)}"
     )
 
 
-def _check_reachable(address: str) -> None:
-    """Fail at once without a network; the hub's client tries again for half a minute."""
-    host = urllib.parse.urlsplit(address).hostname
-    if host and not urllib.request.getproxies():
-        socket.getaddrinfo(host, None)
+def check_reachable(address: str) -> None:
+    """Fail soon without a network; clients of the hubs wait for minutes or try again for half a one.
+
+    Args:
+        address: An URL of the host that is to be asked. Behind a proxy nothing is tried: who is asked then is the proxy.
+
+    Raises:
+        OSError: Its host cannot be reached.
+    """
+    parts = urllib.parse.urlsplit(address)
+    if parts.hostname and not urllib.request.getproxies():
+        port = parts.port or (80 if parts.scheme == "http" else 443)
+        socket.create_connection((parts.hostname, port), timeout=_CONNECT_S).close()
 
 
 def _fetch(url: str, path: Path) -> Path:

@@ -21,6 +21,7 @@ from fus3dmaps_core.evaluation.shared_models import shared_segmenter, shared_tri
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.projection import resize_frame
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_core.runtimes.acceleration import accelerate
 from fus3dmaps_core.segmenters.registry import load_segmenter
 
 PUBLISHED_WINDOW_M = 6.0
@@ -48,7 +49,8 @@ def evaluate_dataset(
         "window_no_evidence": {**window, "fusion.keep_most_evidence": False},
     }
     encoder = config.encoder
-    trio = shared_trio(load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights))
+    trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
+    trio = shared_trio(accelerate(trio, encoder, config.image))
     segmenter = shared_segmenter(
         load_segmenter(config.segmenter.name, encoder.device, config.segmenter.weights, encoder.runtime)
     )

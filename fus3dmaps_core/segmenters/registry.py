@@ -11,7 +11,9 @@ from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.protocols import Segmenter
 
 _SEGMENTERS = {
+    "fastsam": "fus3dmaps_core.segmenters.fastsam",
     "lite": "fus3dmaps_core.segmenters.lite",
+    "sam2": "fus3dmaps_core.segmenters.sam2",
 }
 
 

@@ -211,7 +211,7 @@ def test_weights_that_are_not_there_are_named(tmp_path):
 
 
 def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
-    monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda name, device: ColorSegmenter())
+    monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda *options: ColorSegmenter())
     config = Config.from_flat(
         {
             "encoder.name": "clip_dinoiser",

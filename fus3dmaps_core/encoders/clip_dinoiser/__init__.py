@@ -9,17 +9,27 @@ from __future__ import annotations
 
 from typing import Any
 
+from fus3dmaps_core.encoders.cards import EncoderCard
 from fus3dmaps_core.encoders.clip_dinoiser.crop import ClipCropEncoder
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.clip_dinoiser.network import ClipDinoiser, load_clip, load_heads
 from fus3dmaps_core.encoders.clip_dinoiser.patch import DinoiserPatchEncoder
+from fus3dmaps_core.encoders.clip_dinoiser.published import CLIP, HEADS
 from fus3dmaps_core.encoders.clip_dinoiser.text import ClipTextEncoder
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 
-DIMENSION = 512
+CARD = EncoderCard(
+    name="clip_dinoiser",
+    summary="The paper's lighter pair: CLIP ViT-B/16, its patches pooled by DINOiser's heads.",
+    dimension=512,
+    variance_ratio=5.0,  # [sec: Vision Models]
+    patch_px=16,
+    code_licence="MIT (OpenCLIP)",
+    files=(CLIP, HEADS),
+    packages=("open_clip", "torchvision", "safetensors"),
+)
 
-_VARIANCE_RATIO = 5.0  # [sec: Vision Models]
 _LOGIT_SCALE = 100.0  # Where the factor that CLIP learned is capped, and is.
 
 
@@ -62,9 +72,9 @@ def make_trio(clip: Any, heads: DinoiserHeads, device: str, crop_padding: float)
     network = ClipDinoiser(clip.visual, heads).eval().to(device)
     clip.to(device)
     return EncoderTrio(
-        name="clip_dinoiser",
-        dimension=DIMENSION,
-        variance_ratio=_VARIANCE_RATIO,
+        name=CARD.name,
+        dimension=CARD.dimension,
+        variance_ratio=CARD.variance_ratio,
         logit_scale=_LOGIT_SCALE,
         patch=DinoiserPatchEncoder(network, device),
         crop=ClipCropEncoder(clip.visual, crop_padding, device),

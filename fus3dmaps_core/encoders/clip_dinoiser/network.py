@@ -13,7 +13,7 @@ from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.clip_dinoiser.maskclip import MaskClip
 from fus3dmaps_core.encoders.clip_dinoiser.published import ARCHITECTURE, CLIP, HEADS
 from fus3dmaps_core.encoders.optional_packages import import_optional
-from fus3dmaps_core.encoders.weights import find_weights, fit, local_path, read_state
+from fus3dmaps_core.encoders.weights import find_weights, fit, only_directory, read_state, saying_what_to_get
 
 MEAN = (0.48145466, 0.4578275, 0.40821073)
 """Of red, green and blue in [0, 1], which CLIP's images are normalised with."""
@@ -50,6 +50,19 @@ class ClipDinoiser(nn.Module):
         return functional.normalize(pooled.permute(0, 2, 3, 1), dim=3), self.heads.saliency(features.intermediate)
 
 
+class ClipCrops(nn.Module):
+    """Unit embeddings of normalised images, each as a whole."""
+
+    def __init__(self, visual: Any) -> None:
+        """Share an ``open_clip`` image transformer."""
+        super().__init__()
+        self.visual = visual
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        """Embed (n, 3, side, side) images, normalised with MEAN and STD, as (n, 512)."""
+        return functional.normalize(self.visual(images), dim=1)
+
+
 def build_clip() -> Any:
     """The CLIP model of the pair with random weights, on the CPU.
 
@@ -69,7 +82,8 @@ def load_clip(weights: str) -> Any:
     """
     clip = build_clip()
     path = find_weights(_PARAMETER, weights, CLIP)
-    fit(clip, read_state(path), f"weights '{path}'")
+    with saying_what_to_get(_PARAMETER, CLIP):
+        fit(clip, read_state(path), f"weights '{path}'")
     return clip
 
 
@@ -79,9 +93,8 @@ def load_heads(weights: str) -> DinoiserHeads:
     Raises:
         EncoderError: The weights are missing, damaged, or another architecture's.
     """
-    # A file or a repository of the hub is CLIP's.
-    place = local_path(weights)
-    path = find_weights(_PARAMETER, weights if place is not None and place.is_dir() else "", HEADS)
+    path = find_weights(_PARAMETER, only_directory(weights), HEADS)  # A file or a repository of the hub is CLIP's.
     heads = DinoiserHeads().eval().requires_grad_(False)
-    fit(heads, read_state(path), f"weights '{path}'")
+    with saying_what_to_get(_PARAMETER, HEADS):
+        fit(heads, read_state(path), f"weights '{path}'")
     return heads

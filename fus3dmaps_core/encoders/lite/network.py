@@ -20,6 +20,7 @@ CLASSES = 1000
 MEAN = 127.0
 _STD = 128.0
 _EPSILON = 1e-3
+_POOLING = 3
 # Repeats, kernel, stride of the first, expansion, channels in, channels out of each stage.
 _STAGES = (
     (1, 3, 1, 1, 32, 16),
@@ -120,6 +121,28 @@ class EfficientNetLite0(nn.Module):
     def forward(self, rgb: Tensor) -> Tensor:
         """Class logits (n, 1000) of whole images."""
         return self.logits(self.features(rgb).mean(dim=(2, 3)))
+
+
+class PatchLogits(nn.Module):
+    """Class logits of every patch: the classifier on each cell of the pooled feature map, brought to a finer grid."""
+
+    def __init__(self, network: EfficientNetLite0, upsampling: int) -> None:
+        """Share the classifier.
+
+        Args:
+            network: The classifier.
+            upsampling: Patches along a side of a cell of its feature map.
+        """
+        super().__init__()
+        self.network, self._upsampling = network, upsampling
+
+    def forward(self, rgb: Tensor) -> Tensor:
+        """Logits (n, rows, columns, 1000) of images as :class:`EfficientNetLite0` takes them."""
+        features = functional.avg_pool2d(self.network.features(rgb), _POOLING, 1, _POOLING // 2, count_include_pad=False)
+        logits = self.network.logits(features.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
+        # The classifier is linear and the weights of the interpolation sum to one: logits of the interpolated features.
+        logits = functional.interpolate(logits, scale_factor=self._upsampling, mode="bilinear", align_corners=False)
+        return logits.permute(0, 2, 3, 1)
 
 
 def _fold(module: nn.Module, conv: str, norm: str) -> None:

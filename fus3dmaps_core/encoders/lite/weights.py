@@ -24,7 +24,7 @@ from pathlib import Path
 
 from fus3dmaps_core.errors import EncoderError
 
-EXTRA = "fus3dmaps[lite]"
+EXTRA = "fus3dmaps_ros[lite]"
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,11 @@ class SummaryHead(nn.Module):
         super().__init__()
         self._mlp, self.token, self.dimension = mlp, token, dimension
 
+    @property
+    def dtype(self) -> torch.dtype:
+        """Precision of the weights."""
+        return cast(torch.Tensor, next(self._mlp.parameters())).dtype
+
     def forward(self, features: torch.Tensor) -> torch.Tensor:
         """Project (..., width) features: (..., d) float32, unit length."""
         # The length is taken in float32: half precision loses squares.
@@ -48,8 +53,8 @@ class PatchNetwork(nn.Module):
         self.backbone, self.head = backbone, head
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Embed the patches, in the precision of the weights up to the last step."""
-        return cast(torch.Tensor, self.head(self.backbone.patches(images)))
+        """Embed the patches of float32 images, in the precision of the weights up to the last step."""
+        return cast(torch.Tensor, self.head(self.backbone.patches(images.to(self.head.dtype))))
 
 
 class CropNetwork(nn.Module):
@@ -61,8 +66,8 @@ class CropNetwork(nn.Module):
         self.backbone, self.head = backbone, head
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Embed the images."""
-        return cast(torch.Tensor, self.head(self.backbone.summary(images, self.head.token)))
+        """Embed float32 images, in the precision of the weights up to the last step."""
+        return cast(torch.Tensor, self.head(self.backbone.summary(images.to(self.head.dtype), self.head.token)))
 
 
 def load_head(checkpoint: Checkpoint, name: str, checkout: Path, encoder: str) -> SummaryHead:

@@ -16,10 +16,26 @@ import torch
 
 from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.radio.published import REPOSITORY, REVISION
+from fus3dmaps_core.encoders.weights import check_reachable, local_path
 from fus3dmaps_core.errors import EncoderError
+
+ARCHIVE = f"https://github.com/{REPOSITORY}/archive/{REVISION}.zip"
+"""The pinned revision, to be unpacked."""
 
 _FOLDER = "RADIO"  # Of a checkout in the directory that encoder.weights names.
 _import_lock = threading.Lock()
+
+
+def cached_checkout() -> Path:
+    """Where the pinned revision lies, or may be put, in the cache of ``torch.hub``."""
+    return Path(torch.hub.get_dir()) / f"{REPOSITORY.replace('/', '_')}_{REVISION}"
+
+
+def locate_checkout(weights: str) -> Path | None:
+    """Directory of RADIO's code without any download: see :func:`find_checkout`; None where it is not on this machine."""
+    directory = local_path(weights)
+    candidates = (*((directory / _FOLDER,) if directory else ()), cached_checkout())
+    return next((path for path in candidates if (path / "hubconf.py").is_file()), None)
 
 
 def find_checkout(weights: str, encoder: str) -> Path:
@@ -36,13 +52,12 @@ def find_checkout(weights: str, encoder: str) -> Path:
     """
     for package in ("timm", "einops"):
         import_optional(package, encoder)
-    local = Path(weights).expanduser() / _FOLDER
-    if weights and (local / "hubconf.py").is_file():
-        return local
-    cached = Path(torch.hub.get_dir()) / f"{REPOSITORY.replace('/', '_')}_{REVISION}"
-    if (cached / "hubconf.py").is_file():
-        return cached
+    found = locate_checkout(weights)
+    if found is not None:
+        return found
+    cached = cached_checkout()
     try:
+        check_reachable(ARCHIVE)
         # Fetches the code and imports it; the name of a commit says what is in it, so there is nothing more to trust.
         hub: Any = torch.hub  # Without type hints.
         hub.list(f"{REPOSITORY}:{REVISION}", skip_validation=True, trust_repo=True, verbose=False)
@@ -50,8 +65,8 @@ def find_checkout(weights: str, encoder: str) -> Path:
         first = (str(error).splitlines() or [type(error).__name__])[0]
         raise EncoderError(
             f"encoder '{encoder}': RADIO's code is not on this machine and cannot be downloaded ({first}); unpack "
-            f"https://github.com/{REPOSITORY}/archive/{REVISION}.zip so that its hubconf.py lies in '{cached}', or in the "
-            f"folder '{_FOLDER}' of a directory that 'encoder.weights' names"
+            f"{ARCHIVE} so that its hubconf.py lies in '{cached}', or in the folder '{_FOLDER}' of a directory that "
+            "'encoder.weights' names"
         ) from None
     return cached
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from fus3dmaps_core.encoders.crop_batches import CropBatcher
+from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import PatchEmbeddings
 from fus3dmaps_core.encoders.radio.adaptor import CropNetwork, PatchNetwork
 from fus3dmaps_core.masks import Masks
@@ -19,12 +22,13 @@ class RadioPatchEncoder:
     """Embeds 16-pixel patches in one pass; all weights are 1.
 
     Attributes:
-        network: From normalised images to embeddings; another that gives the same may be put in its place.
+        network: From normalised images to embeddings, in torch.
     """
 
     def __init__(self, network: PatchNetwork, device: str, dtype: torch.dtype) -> None:
-        """Keep the network, which is on the device already, its weights in the given precision."""
-        self.network, self._device, self._dtype = network, torch.device(device), dtype
+        """Keep the network, on the device already, and bring its weights to the given precision."""
+        self.network, self._device = network.to(dtype), torch.device(device)
+        self._run: Network = self.network
         # Pixels are bytes: (x / 255 - mean) / std in one step.
         self._mean = 255.0 * torch.tensor(network.backbone.mean, device=self._device).reshape(1, 3, 1, 1)
         self._std = 255.0 * torch.tensor(network.backbone.std, device=self._device).reshape(1, 3, 1, 1)
@@ -41,33 +45,46 @@ class RadioPatchEncoder:
         image and nothing else.
         """
         rows, columns = self.grid(*rgb.shape[:2])
-        height, width = (self.network.backbone.patch_px * side for side in (rows, columns))
+        height, width = self._stretched(*rgb.shape[:2])
         if rgb.shape[:2] != (height, width):
             rgb = np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
         with torch.inference_mode():
             image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device).permute(2, 0, 1)[None].float()
-            embeddings = self.network(image.sub_(self._mean).div_(self._std).to(self._dtype))
+            embeddings = cast(torch.Tensor, self._run(image.sub_(self._mean).div_(self._std)))
             return PatchEmbeddings(embeddings[0].cpu().numpy(), np.ones((rows, columns), np.float32))
+
+    def graph(self, height: int, width: int) -> Graph:
+        """The network at the size that an image of this one is stretched to."""
+        return Graph("patch", self.network, (1, 3, *self._stretched(height, width)), ("embeddings",))
+
+    def run_with(self, network: Network) -> None:
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        self._run = network
+
+    def _stretched(self, height: int, width: int) -> tuple[int, int]:
+        rows, columns = self.grid(height, width)
+        return self.network.backbone.patch_px * rows, self.network.backbone.patch_px * columns
 
 
 class RadioCropEncoder:
     """Embeds the boxes around masks by the summary of each crop.
 
     Attributes:
-        network: From normalised images to embeddings.
+        network: From normalised images to embeddings, in torch.
     """
 
     def __init__(self, network: CropNetwork, size_px: int, padding: float, device: str, dtype: torch.dtype) -> None:
         """Keep the network, which is on the device already.
 
         Args:
-            network: Its weights in the given precision.
+            network: Its weights are brought to the given precision.
             size_px: Edge of its input, a multiple of a patch's.
             padding: Around a mask's box, as a share of its size.
             device: Torch device.
             dtype: Precision of the weights.
         """
-        self.network, self._dtype = network, dtype
+        self.network, self._size_px = network.to(dtype), size_px
+        self._run: Network = self.network
         self._crops = CropBatcher(size_px, network.backbone.mean, network.backbone.std, padding, device)
 
     def encode_crops(self, rgb: NDArray[np.uint8], masks: Masks) -> NDArray[np.float32]:
@@ -75,7 +92,15 @@ class RadioCropEncoder:
         if not len(masks):
             return np.zeros((0, self.network.head.dimension), np.float32)
         with torch.inference_mode():
-            images = self._crops.batch(rgb, masks.boxes).to(self._dtype)
-            parts = [self.network(batch) for batch in torch.split(images, _BATCH)]
+            images = self._crops.batch(rgb, masks.boxes)
+            parts = [cast(torch.Tensor, self._run(batch)) for batch in torch.split(images, _BATCH)]
             embeddings: NDArray[np.float32] = torch.cat(parts).cpu().numpy()
         return embeddings
+
+    def graph(self, height: int, width: int) -> Graph:
+        """The network for a batch of crops, whose size is that of no image."""
+        return Graph("crop", self.network, (_BATCH, 3, self._size_px, self._size_px), ("embeddings",))
+
+    def run_with(self, network: Network) -> None:
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        self._run = network

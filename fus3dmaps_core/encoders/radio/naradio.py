@@ -13,6 +13,7 @@ from fus3dmaps_core.encoders.radio.published import RADIO_LARGE, SIGLIP
 
 NARADIO = pair.RadioPair(
     name="naradio",
+    summary="The paper's pair: RADIO v2.5-L with neighbourhood attention, in SigLIP's space.",
     radio=RADIO_LARGE,
     teacher="siglip",
     text=SIGLIP,
@@ -21,6 +22,8 @@ NARADIO = pair.RadioPair(
     variance_ratio=1.0,  # [sec: Vision Models]
     crop_px=336,  # Its authors report one point of zero-shot accuracy less than at 768, which is five times the work.
 )
+
+CARD = NARADIO.card
 
 
 def load_trio(device: str, crop_padding: float, weights: str) -> EncoderTrio:

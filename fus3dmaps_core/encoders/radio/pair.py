@@ -6,18 +6,22 @@ from dataclasses import dataclass
 
 import torch
 
+from fus3dmaps_core.encoders.cards import CodeCheckout, EncoderCard
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.encoders.radio.adaptor import CropNetwork, PatchNetwork, SummaryHead, load_head
 from fus3dmaps_core.encoders.radio.backbone import DenseAttention, RadioBackbone
-from fus3dmaps_core.encoders.radio.checkout import find_checkout
+from fus3dmaps_core.encoders.radio.checkout import ARCHIVE, cached_checkout, find_checkout, import_from, locate_checkout
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.images import RadioCropEncoder, RadioPatchEncoder
-from fus3dmaps_core.encoders.radio.published import TextTower
+from fus3dmaps_core.encoders.radio.published import CODE_LICENCE
 from fus3dmaps_core.encoders.radio.text import load_text
-from fus3dmaps_core.encoders.weights import WeightFile, find_weights
+from fus3dmaps_core.encoders.siglip_text import TextTower
+from fus3dmaps_core.encoders.weights import WeightFile, find_weights, saying_what_to_get
 from fus3dmaps_core.errors import EncoderError
 
+_PATCH_PX = 16  # Of all published RADIO models of these versions.
+_PACKAGES = ("einops", "open_clip", "safetensors", "timm", "tokenizers", "torchvision", "transformers")
 _LOGIT_SCALE = 100.0  # As the evaluations of these models do; SigLIP's own factor is of this size.
 
 
@@ -27,6 +31,7 @@ class RadioPair:
 
     Attributes:
         name: Registry name.
+        summary: What it is and for which machine, a sentence.
         radio: RADIO's checkpoint.
         teacher: Name of the teacher of its vision-language space in the checkpoint.
         text: The teacher's text tower.
@@ -37,6 +42,7 @@ class RadioPair:
     """
 
     name: str
+    summary: str
     radio: WeightFile
     teacher: str
     text: TextTower
@@ -44,6 +50,21 @@ class RadioPair:
     attention: DenseAttention
     variance_ratio: float
     crop_px: int
+
+    @property
+    def card(self) -> EncoderCard:
+        """What there is to know about the pair without loading it."""
+        return EncoderCard(
+            name=self.name,
+            summary=self.summary,
+            dimension=self.dimension,
+            variance_ratio=self.variance_ratio,
+            patch_px=_PATCH_PX,
+            code_licence=CODE_LICENCE,
+            files=(self.radio, self.text.weights, self.text.tokenizer),
+            packages=_PACKAGES,
+            checkout=CodeCheckout("RADIO's code", ARCHIVE, cached_checkout, locate_checkout),
+        )
 
 
 def load_trio(pair: RadioPair, device: str, crop_padding: float, weights: str) -> EncoderTrio:
@@ -84,7 +105,10 @@ def load_networks(pair: RadioPair, weights: str) -> tuple[RadioBackbone, Summary
         EncoderError: As :func:`load_trio`.
     """
     checkout = find_checkout(weights, pair.name)
-    checkpoint = read_checkpoint(find_weights("encoder.weights", weights, pair.radio), checkout, pair.name)
+    import_from(checkout, "radio.adaptor_module_factory", pair.name)  # First: no other weights would help if this fails.
+    path = find_weights("encoder.weights", weights, pair.radio)
+    with saying_what_to_get("encoder.weights", pair.radio):
+        checkpoint = read_checkpoint(path, checkout, pair.name)
     head = load_head(checkpoint, pair.teacher, checkout, pair.name)
     if head.dimension != pair.dimension:
         raise EncoderError(

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from fus3dmaps_core.encoders.siglip_text import TextTower
 from fus3dmaps_core.encoders.weights import WeightFile
 
 REPOSITORY = "NVlabs/RADIO"
@@ -29,37 +28,6 @@ C_RADIO_BASE = WeightFile(
     sha256="",
     licence="NVIDIA Open Model License",
 )
-
-
-@dataclass(frozen=True)
-class TextTower:
-    """A published text tower of SigLIP's kind.
-
-    Attributes:
-        weights: File of the whole model, as the package ``transformers`` names its weights.
-        tokenizer: Its tokenizer.
-        vocabulary: How many tokens it knows.
-        end_id: Token that ends a sentence.
-        pad_id: Token that fills the context, and that the embedding is read from.
-        dimension: Length of an embedding.
-        width: Length of a token inside.
-        hidden: Width inside the MLPs.
-        layers: How many blocks.
-        heads: Of attention.
-        context: Tokens of a sentence.
-    """
-
-    weights: WeightFile
-    tokenizer: WeightFile
-    vocabulary: int
-    end_id: int
-    pad_id: int
-    dimension: int = 1152
-    width: int = 1152
-    hidden: int = 4304
-    layers: int = 27
-    heads: int = 16
-    context: int = 64
 
 
 def _file(title: str, repository: str, name: str) -> WeightFile:

@@ -24,6 +24,7 @@ def _attention(attention: Any, prefix_tokens: int) -> nn.Module:
 
 RADSEG = pair.RadioPair(
     name="radseg",
+    summary="C-RADIO v3-B with recursive attention; its authors report more than naradio's with a third of its weights.",
     radio=C_RADIO_BASE,
     teacher="siglip2",
     text=SIGLIP2,
@@ -32,6 +33,8 @@ RADSEG = pair.RadioPair(
     variance_ratio=1.0,  # Not known; NARADIO's, whose kind of features these are.
     crop_px=336,  # As for NARADIO.
 )
+
+CARD = RADSEG.card
 
 
 def load_trio(device: str, crop_padding: float, weights: str) -> EncoderTrio:

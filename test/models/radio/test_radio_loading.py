@@ -13,6 +13,7 @@ import pytest
 import torch
 from radio_files import write_checkpoint
 
+from fus3dmaps_core.encoders.radio import checkout as checkout_module
 from fus3dmaps_core.encoders.radio.checkout import find_checkout, import_from
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
@@ -53,6 +54,7 @@ def test_the_code_is_fetched_at_the_pinned_revision(monkeypatch, tmp_path, check
         )
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(checkout_module, "check_reachable", lambda _: None)
     monkeypatch.setattr(torch.hub, "list", fetch)
     found = find_checkout("", "naradio")
     assert asked == [(f"NVlabs/RADIO:{REVISION}", True)]
@@ -66,10 +68,22 @@ def test_without_a_network_the_message_says_what_to_put_where(monkeypatch, tmp_p
         raise URLError("no network")
 
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr(checkout_module, "check_reachable", lambda _: None)
     monkeypatch.setattr(torch.hub, "list", refuse)
     with pytest.raises(EncoderError, match=rf"naradio.*no network.*{REVISION}\.zip.*NVlabs_RADIO_{REVISION}") as refusal:
         find_checkout("", "naradio")
     assert "\n" not in str(refusal.value)
+
+
+def test_a_host_that_does_not_answer_is_not_waited_for(monkeypatch, tmp_path):
+    def no_answer(address, timeout):
+        raise TimeoutError(f"{address[0]} timed out after {timeout:.0f} s")
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    monkeypatch.setattr("urllib.request.getproxies", dict)
+    monkeypatch.setattr("socket.create_connection", no_answer)
+    with pytest.raises(EncoderError, match=rf"github\.com timed out after 5 s.*{REVISION}\.zip"):
+        find_checkout("", "naradio")
 
 
 def test_another_package_of_the_same_name_is_not_mistaken_for_it(checkout, tmp_path):

@@ -11,7 +11,7 @@ from tokenizers import Tokenizer
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
 from fus3dmaps_core.encoders.radio.pair import load_text_encoder
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
-from fus3dmaps_core.encoders.radio.text import build_tower, canonical
+from fus3dmaps_core.encoders.siglip_text import build_tower, canonical
 
 
 def test_a_prompt_is_the_unit_mean_of_its_unit_sentences(loaded):

@@ -16,7 +16,7 @@ from fus3dmaps_core.errors import EncoderError
 def test_a_missing_package_is_named_with_the_extra_that_has_it(load, monkeypatch):
     monkeypatch.setitem(sys.modules, "open_clip", None)  # As if it were not installed.
     monkeypatch.delitem(sys.modules, "open_clip.model", raising=False)
-    with pytest.raises(EncoderError, match=r"'clip_dinoiser'.*'open_clip.*fus3dmaps\[models\]") as refusal:
+    with pytest.raises(EncoderError, match=r"'clip_dinoiser'.*'open_clip.*fus3dmaps_ros\[models\]") as refusal:
         load()
     assert "\n" not in str(refusal.value)
 

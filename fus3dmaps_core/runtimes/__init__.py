@@ -1,0 +1,1 @@
+"""What runs the encoders' networks other than torch as it is: exported graphs in ONNX Runtime or TensorRT, torch.compile."""

@@ -1,0 +1,28 @@
+"""The segmenter ``sam2``: SAM 2.1 Hiera tiny (Ravi et al. 2024) asked at a grid of points; code and weights Apache-2.0.
+
+A learned segmenter under a permissive licence. It needs the package ``transformers`` and a GPU: every point is a pass of the
+decoder, which takes many times what FastSAM takes for the whole image. ``segmenter.weights`` is ``model.safetensors`` of
+``facebook/sam2.1-hiera-tiny``, its directory, or that repository of the hub, which is also the default.
+"""
+
+from __future__ import annotations
+
+from fus3dmaps_core.config import Runtime
+from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.segmenters.sam2.network import load_sam2
+from fus3dmaps_core.segmenters.sam2.segmenter import Sam2Segmenter
+
+
+def load(device: str, weights: str, runtime: Runtime) -> Sam2Segmenter:
+    """Load the segmenter, which torch runs whatever the runtime of the encoders.
+
+    Args:
+        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        weights: Where the weights are, see :mod:`fus3dmaps_core.encoders.weights`.
+        runtime: Not used.
+
+    Raises:
+        EncoderError: The device cannot be used, the package is missing, or weights are missing, damaged or others.
+    """
+    check_device(device)
+    return Sam2Segmenter(load_sam2(weights).to(device), device)

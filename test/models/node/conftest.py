@@ -1,0 +1,74 @@
+"""Pairs with random weights, a short recording, and the maps that the pairs make of it without ROS."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from ros.conftest import signals, start, user  # noqa: F401  (fixtures)
+from weights_cache import WeightsCache, shorten_text_towers, write_weights
+
+from fus3dmaps_core.config import Config
+from fus3dmaps_core.recordings.writer import RecordingWriter
+from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+
+FRAMES = 2
+SETTINGS = {
+    "image.width": 160,
+    "image.height": 128,
+    "segmenter.min_area_px": 100,
+    "segmenter.max_masks": 2,
+    "node.service_timeout_s": 120.0,
+}
+"""What all pairs are given: small images, and few crops of them."""
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory) -> Path:
+    """Keyframes of both layers, and nothing else."""
+    path = tmp_path_factory.mktemp("recording") / "room.mcap"
+    room = FurnishedRoom(frames=30)
+    with RecordingWriter(path) as writer:
+        for index in range(FRAMES):
+            writer.write(room.frame(index))
+    return path
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory) -> Iterator[WeightsCache]:
+    """Weights for as long as they are needed: pytest keeps what tests leave, and these take a gigabyte."""
+    root = tmp_path_factory.mktemp("cache")
+    yield write_weights(root)
+    shutil.rmtree(root)
+
+
+@pytest.fixture(scope="session")
+def maps(tmp_path_factory) -> Path:
+    """The directory of saved maps."""
+    return tmp_path_factory.mktemp("maps")
+
+
+@pytest.fixture(scope="session")
+def parameters(cache, maps) -> Callable[[str], dict[str, object]]:
+    """Every parameter of a node or pipeline with the pair of a name."""
+
+    def of_pair(name: str) -> dict[str, object]:
+        return {**SETTINGS, "node.map_directory": str(maps), "encoder.name": name, **cache.parameters.get(name, {})}
+
+    return of_pair
+
+
+@pytest.fixture
+def cached(cache, monkeypatch) -> None:
+    """This process finds the weights, too."""
+    for variable, value in cache.environment.items():
+        monkeypatch.setenv(variable, value)
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(Path(cache.environment["HF_HOME"]) / "hub"))
+    shorten_text_towers(monkeypatch.setattr)
+
+
+@pytest.fixture(scope="session")
+def config(parameters) -> Callable[[str], Config]:
+    return lambda name: Config().with_values(parameters(name))

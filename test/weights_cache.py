@@ -1,0 +1,102 @@
+"""Random weights of every large pair, where the published ones would lie on a machine that needs no network.
+
+The networks are as wide as the published ones. RADIO's transformers have four blocks, as their checkpoints may say; SigLIP's
+text towers have one block and few words, as :func:`shorten_text_towers` has the pairs expect: each prompt is embedded in
+eighty sentences, which takes a minute and a half through 27 blocks on two cores.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import siglip2_files
+import torch
+from radio_files import PAIRS, find_checkout, write_checkpoint, write_text
+
+from fus3dmaps_core.encoders import siglip2
+from fus3dmaps_core.encoders.clip_dinoiser import network as clip_dinoiser
+from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
+from fus3dmaps_core.encoders.radio import naradio, radseg
+from fus3dmaps_core.encoders.radio.pair import RadioPair
+from fus3dmaps_core.encoders.radio.published import REVISION
+from fus3dmaps_core.encoders.siglip_text import TextTower
+from fus3dmaps_core.encoders.weights import WeightFile
+
+MODELS = {"naradio": "vit_large_patch16_224", "radseg": "vit_base_patch16_224"}
+BLOCKS = 4
+VOCABULARY = 100
+
+
+@dataclass(frozen=True)
+class WeightsCache:
+    """Where they are.
+
+    Attributes:
+        environment: Variables under which a process finds them as it finds published ones.
+        parameters: By pair, what has to be said besides its name. Files whose hash is known cannot be made of random
+            numbers; these are files of one's own, under another name.
+    """
+
+    environment: dict[str, str]
+    parameters: dict[str, dict[str, str]]
+
+
+def shorten_text_towers(set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
+    """Have the pairs expect text towers of one block, in this process."""
+    for module, attribute in ((naradio, "NARADIO"), (radseg, "RADSEG")):
+        set_attribute(module, attribute, _with_short_text(getattr(module, attribute)))
+    set_attribute(siglip2, "TEXT", _short(siglip2.TEXT))
+
+
+def write_weights(root: Path) -> WeightsCache:
+    """Write random weights of all pairs, always the same ones."""
+    environment = {"XDG_CACHE_HOME": str(root), "TORCH_HOME": str(root / "torch"), "HF_HOME": str(root / "hub")}
+    own = {name: root / "own" / name for name in ("clip_dinoiser", "siglip2")}
+    for folder in own.values():
+        folder.mkdir(parents=True)
+    torch.manual_seed(17)
+    with torch.inference_mode():
+        _write_radio(root)
+        _write_clip_dinoiser(own["clip_dinoiser"])
+        siglip2_files.write_directory(own["siglip2"], siglip2_files.random_model(384, _short(siglip2.TEXT)))
+    return WeightsCache(environment, {name: {"encoder.weights": str(folder)} for name, folder in own.items()})
+
+
+def _short(tower: TextTower) -> TextTower:
+    return replace(tower, layers=1, vocabulary=VOCABULARY)
+
+
+def _with_short_text(pair: RadioPair) -> RadioPair:
+    return replace(pair, text=_short(pair.text))
+
+
+def _write_radio(root: Path) -> None:
+    checkout = find_checkout()
+    hub = root / "torch" / "hub"
+    hub.mkdir(parents=True)
+    (hub / f"NVlabs_RADIO_{REVISION}").symlink_to(checkout, target_is_directory=True)
+    for name, model in MODELS.items():
+        pair = PAIRS[name]
+        write_checkpoint(_place(root, pair.radio), checkout, name, 1520, 3, model, depth=BLOCKS)
+        write_text(root, _with_short_text(pair))
+        for file in (pair.text.weights, pair.text.tokenizer):
+            shutil.move(root / file.file_name, _place(root, file))
+
+
+def _write_clip_dinoiser(folder: Path) -> None:
+    from safetensors.torch import save_file
+
+    save_file(clip_dinoiser.build_clip().state_dict(), folder / "open_clip_model.safetensors")
+    # Under the published name, last.pt, it would need the published hash.
+    save_file(DinoiserHeads().state_dict(), folder / "last.safetensors")
+
+
+def _place(root: Path, file: WeightFile) -> Path:
+    """Where a published file lies in the cache below a directory; its folder is made."""
+    path = root / "fus3dmaps" / file.cached_path.parent.name / file.cached_path.name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
