@@ -106,10 +106,8 @@ class Pipeline:
             EncoderError: One of them is unknown, its packages or weights are missing or altered, or the runtime cannot be
                 used.
         """
-        segmenter = load_segmenter(
-            config.segmenter.name, config.encoder.device, config.segmenter.weights, config.encoder.runtime
-        )
         encoder = config.encoder
+        segmenter = load_segmenter(config.segmenter.name, encoder, config.segmenter.weights)
         trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
         trio = accelerate(trio, encoder, config.image)
         trio = replace(trio, text=CachedTextEncoder(trio.text))

@@ -8,17 +8,22 @@ from pathlib import Path
 import numpy as np
 import torch
 from radio_files import find_checkout, small_text_pair, write_checkpoint, write_text
+from siglip2_files import random_model, write_directory
 from torch import nn
 from torch.nn import functional
 
+from fus3dmaps_core.encoders import siglip2
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.encoders.radio import pair as radio_pair
+from fus3dmaps_core.encoders.siglip2 import published as siglip2_published
+from fus3dmaps_core.encoders.siglip2.network import read_vision
+from fus3dmaps_core.encoders.siglip_text import read_text
 from fus3dmaps_core.masks import Masks
 
-PAIRS = ("lite", "clip_dinoiser", "naradio", "radseg")
+PAIRS = ("lite", "clip_dinoiser", "naradio", "radseg", "siglip2")
 HEIGHT, WIDTH = 100, 150  # No multiples of a patch.
 CROP_PX = 64
 
@@ -41,6 +46,17 @@ def narrow_radio(name: str, folder: Path) -> EncoderTrio:
     write_checkpoint(folder / pair.radio.file_name, checkout, name, 48, 2, "vit_tiny_patch16_224", depth=3)
     write_text(folder, pair)
     return radio_pair.load_trio(pair, "cpu", 0.05, str(folder))
+
+
+def narrow_siglip2(folder: Path) -> EncoderTrio:
+    """An embedding has the full width of 768; there are 3 blocks in place of 12."""
+    torch.manual_seed(13)
+    text = replace(siglip2_published.TEXT, vocabulary=40, width=32, hidden=48, layers=1, heads=2)
+    write_directory(folder, random_model(CROP_PX, text))
+    tokens = read_vision(folder / "model.pt")
+    tokens.vision.encoder.layers = tokens.vision.encoder.layers[:3]
+    reader = read_text(text, folder / "model.pt", folder / "tokenizer.json", "cpu", "siglip2")
+    return siglip2.make_trio(tokens, reader, "cpu", 0.05)
 
 
 def boxes(count: int) -> Masks:

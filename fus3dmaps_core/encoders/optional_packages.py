@@ -10,12 +10,13 @@ from fus3dmaps_core.errors import EncoderError
 EXTRA = "fus3dmaps_ros[models]"
 
 
-def import_optional(module: str, encoder: str) -> ModuleType:
+def import_optional(module: str, name: str, kind: str = "encoder") -> ModuleType:
     """Import a module of a package that the base installation does not have.
 
     Args:
         module: Dotted name.
-        encoder: Who needs it, for the message.
+        name: Who needs it, for the message.
+        kind: What that is, an encoder or a segmenter.
 
     Raises:
         EncoderError: It is not installed, or not for this torch; the message names the extra that has it.
@@ -23,8 +24,6 @@ def import_optional(module: str, encoder: str) -> ModuleType:
     try:
         return import_module(module)
     except ImportError as error:
-        raise EncoderError(
-            f"encoder '{encoder}' needs '{error.name or module}', which is not installed; use {EXTRA}"
-        ) from None
+        raise EncoderError(f"{kind} '{name}' needs '{error.name or module}', which is not installed; use {EXTRA}") from None
     except (RuntimeError, OSError, AttributeError) as error:  # So torchvision fails beside another torch than its own.
-        raise EncoderError(f"encoder '{encoder}': cannot import '{module}' ({error}); install {EXTRA}") from None
+        raise EncoderError(f"{kind} '{name}': cannot import '{module}' ({error}); install {EXTRA}") from None

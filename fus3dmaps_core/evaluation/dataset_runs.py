@@ -51,9 +51,7 @@ def evaluate_dataset(
     encoder = config.encoder
     trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
     trio = shared_trio(accelerate(trio, encoder, config.image))
-    segmenter = shared_segmenter(
-        load_segmenter(config.segmenter.name, encoder.device, config.segmenter.weights, encoder.runtime)
-    )
+    segmenter = shared_segmenter(load_segmenter(config.segmenter.name, encoder, config.segmenter.weights))
     pipelines = {mode: Pipeline(config.with_values(settings[mode]), trio, segmenter) for mode in MODES}
     for done, frame in enumerate(dataset, start=1):
         working = _at_working_resolution(frame, config)

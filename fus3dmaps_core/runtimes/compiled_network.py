@@ -6,7 +6,7 @@ import torch
 
 from fus3dmaps_core.encoders.graphs import Graph
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.static_batches import run_in_batches
+from fus3dmaps_core.runtimes.static_batches import listed, run_in_batches
 
 
 class CompiledNetwork:
@@ -46,8 +46,7 @@ class CompiledNetwork:
         return run_in_batches(self._run, images, self.shape, self._what)
 
     def _run(self, images: torch.Tensor) -> list[torch.Tensor]:
-        outputs = self._compiled(images)
-        return [outputs] if isinstance(outputs, torch.Tensor) else list(outputs)
+        return listed(self._compiled(images))
 
 
 def _line(error: BaseException) -> str:

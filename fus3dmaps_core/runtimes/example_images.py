@@ -36,12 +36,16 @@ class GraphCropEncoder(CropEncoder, GraphEncoder, Protocol):
     """A crop encoder whose network can be run elsewhere."""
 
 
+def pictures(height: int, width: int) -> list[NDArray[np.uint8]]:
+    """Noise and shapes, two (height, width, 3) uint8 images, always the same."""
+    rng = np.random.default_rng(_SEED)
+    return [_noise(rng, height, width), _scene(rng, height, width)]
+
+
 def patch_images(encoder: GraphPatchEncoder, height: int, width: int) -> torch.Tensor:
     """Two images of this size, pixels, as they reach the network of a patch encoder: (2, 3, H', W') float32 on the CPU."""
-    rng = np.random.default_rng(_SEED)
     graph = encoder.graph(height, width)
-    pictures = (_noise(rng, height, width), _scene(rng, height, width))
-    return torch.cat([_record(encoder, graph, partial(encoder.encode_patches, rgb)) for rgb in pictures])
+    return torch.cat([_record(encoder, graph, partial(encoder.encode_patches, rgb)) for rgb in pictures(height, width)])
 
 
 def crop_images(encoder: GraphCropEncoder, height: int, width: int) -> torch.Tensor:

@@ -21,6 +21,7 @@ from fus3dmaps_core.encoders.graphs import Graph
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.half_precision import emulate_products
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
+from fus3dmaps_core.runtimes.static_batches import listed
 
 
 @dataclass(frozen=True)
@@ -90,9 +91,9 @@ def check_parity(path: Path, graph: Graph, network: nn.Module, images: torch.Ten
     """
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".parity-") as folder:
         runnable = path if precision == "fp32" else _emulated(path, precision, Path(folder))
-        found = _outputs(OnnxNetwork(runnable, "cpu")(images))
+        found = listed(OnnxNetwork(runnable, "cpu")(images))
     with torch.inference_mode():
-        batches = [_outputs(network(batch)) for batch in torch.split(images, graph.shape[0])]
+        batches = [listed(network(batch)) for batch in torch.split(images, graph.shape[0])]
     expected = [torch.cat(parts) for parts in zip(*batches, strict=True)]
     parity = compare(graph.outputs, expected, found, BOUNDS[precision])
     _refuse_above_bound(graph.name, precision, parity)
@@ -140,7 +141,3 @@ def _emulated(path: Path, precision: Precision, folder: Path) -> Path:
     emulated = folder / path.name
     ir.save(model, emulated, external_data=f"{path.name}.data")
     return emulated
-
-
-def _outputs(values: torch.Tensor | tuple[torch.Tensor, ...]) -> list[torch.Tensor]:
-    return [values] if isinstance(values, torch.Tensor) else list(values)

@@ -17,6 +17,11 @@ Outputs = torch.Tensor | tuple[torch.Tensor, ...]
 """What a graph gives: a tensor, or several."""
 
 
+def listed(outputs: Outputs) -> list[torch.Tensor]:
+    """The outputs of a graph as a list, be they one or several."""
+    return [outputs] if isinstance(outputs, torch.Tensor) else list(outputs)
+
+
 def run_in_batches(run: Run, images: torch.Tensor, shape: Sequence[int], what: str) -> Outputs:
     """Run images through a graph of fixed shape.
 

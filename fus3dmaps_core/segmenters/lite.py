@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
 
-from fus3dmaps_core.config import Runtime
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.encoders.lite.detector import Detections, Detector, shared_detector
 from fus3dmaps_core.encoders.lite.evidence import box_iou
 from fus3dmaps_core.errors import EncoderError
@@ -31,7 +31,7 @@ _DEPTH_STEP = 1.2  # Ratio of mean depths from which a box shows a thing and som
 _SAME_IOU = 0.85
 
 
-def load(device: str, weights: str, runtime: Runtime) -> LiteSegmenter:
+def load(encoder: EncoderConfig, weights: str) -> LiteSegmenter:
     """Load the segmenter, which runs on the CPU whatever the device and the runtime.
 
     Raises:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import cast
 
-from fus3dmaps_core.config import Runtime
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.protocols import Segmenter
 
@@ -22,19 +22,18 @@ def names() -> list[str]:
     return sorted(_SEGMENTERS)
 
 
-def load_segmenter(name: str, device: str, weights: str = "", runtime: Runtime = "torch") -> Segmenter:
-    """Load a segmenter; its module's ``load(device, weights, runtime)`` builds it.
+def load_segmenter(name: str, encoder: EncoderConfig, weights: str = "") -> Segmenter:
+    """Load a segmenter; its module's ``load(encoder, weights)`` builds it.
 
     Args:
         name: Registry name.
-        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        encoder: Its ``device``, ``runtime``, ``precision`` and ``graph_directory`` hold for segmenters as well.
         weights: Where its weights are, see :mod:`fus3dmaps_core.encoders.weights`; "" for the published ones.
-        runtime: What runs the networks; a segmenter that comes as an exported graph takes ``torch`` as ONNX Runtime.
 
     Raises:
         EncoderError: The name is unknown, or what it needs is not installed.
     """
     if name not in _SEGMENTERS:
         raise EncoderError(f"parameter 'segmenter.name': unknown segmenter '{name}', known are {', '.join(names())}")
-    load = cast(Callable[[str, str, Runtime], Segmenter], import_module(_SEGMENTERS[name]).load)
-    return load(device, weights, runtime)
+    load = cast(Callable[[EncoderConfig, str], Segmenter], import_module(_SEGMENTERS[name]).load)
+    return load(encoder, weights)

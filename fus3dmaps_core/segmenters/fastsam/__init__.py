@@ -13,28 +13,41 @@ Licence: ultralytics' package and the weights that it distributes are under the 
 
 from __future__ import annotations
 
-from fus3dmaps_core.config import Runtime
+import numpy as np
+import torch
+
+from fus3dmaps_core.config import EncoderConfig, Precision
 from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.runtimes.example_images import pictures
+from fus3dmaps_core.runtimes.foreign_graphs import in_precision
 from fus3dmaps_core.runtimes.graph_files import graph_directory
 from fus3dmaps_core.runtimes.opening import open_network
+from fus3dmaps_core.runtimes.tensorrt_network import check_cuda
 from fus3dmaps_core.segmenters.fastsam.contract import input_shape
 from fus3dmaps_core.segmenters.fastsam.published import find_network
 from fus3dmaps_core.segmenters.fastsam.segmenter import FastSamSegmenter
 
 
-def load(device: str, weights: str, runtime: Runtime) -> FastSamSegmenter:
+def load(encoder: EncoderConfig, weights: str) -> FastSamSegmenter:
     """Load the segmenter.
 
     Args:
-        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        encoder: Its ``device`` is the segmenter's. With the runtime ``tensorrt`` the network runs there, in ``precision``,
+            whose files are kept in ``graph_directory``; with all others in ONNX Runtime, as exported.
         weights: The exported network or its directory, see above; "" for this package's cache.
-        runtime: ``tensorrt`` runs the network there, in the precision of its file; all others in ONNX Runtime.
 
     Raises:
         EncoderError: The device cannot be used, a package is missing, or there is no exported network or another one's.
     """
-    check_device(device)
+    check_device(encoder.device)
     path = find_network(weights)
-    shape = input_shape(path)
-    chosen: Runtime = "tensorrt" if runtime == "tensorrt" else "onnxruntime"
-    return FastSamSegmenter(open_network(path, device, chosen, "fp32", graph_directory("")), shape, device)
+    height, width = input_shape(path)
+    directory = graph_directory(encoder.graph_directory)
+    precision: Precision = "fp32"
+    if encoder.runtime == "tensorrt":
+        check_cuda(encoder.device)
+        precision = encoder.precision
+        images = torch.from_numpy(np.stack(pictures(height, width))).permute(0, 3, 1, 2).float().div_(255.0)
+        path = in_precision(path, precision, directory, images)
+    network = open_network(path, encoder.device, encoder.runtime, precision, directory)
+    return FastSamSegmenter(network, (height, width), encoder.device)

@@ -23,7 +23,7 @@ def input_shape(path: Path) -> tuple[int, int]:
         EncoderError: It cannot be read, or is another network's: it must take one float32 image of fixed size whose sides
             are multiples of 32 and give ``(1, 37, N)`` detections and ``(1, 32, h / 4, w / 4)`` prototypes.
     """
-    onnx = import_optional("onnx", "fastsam")
+    onnx = import_optional("onnx", "fastsam", "segmenter")
     try:
         graph = onnx.load(path, load_external_data=False).graph
     except Exception as error:  # The reader raises whatever its format comes across.

@@ -7,22 +7,21 @@ decoder, which takes many times what FastSAM takes for the whole image. ``segmen
 
 from __future__ import annotations
 
-from fus3dmaps_core.config import Runtime
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.segmenters.sam2.network import load_sam2
 from fus3dmaps_core.segmenters.sam2.segmenter import Sam2Segmenter
 
 
-def load(device: str, weights: str, runtime: Runtime) -> Sam2Segmenter:
+def load(encoder: EncoderConfig, weights: str) -> Sam2Segmenter:
     """Load the segmenter, which torch runs whatever the runtime of the encoders.
 
     Args:
-        device: Torch device, e.g. ``cpu`` or ``cuda:0``.
+        encoder: Its ``device`` is the segmenter's.
         weights: Where the weights are, see :mod:`fus3dmaps_core.encoders.weights`.
-        runtime: Not used.
 
     Raises:
         EncoderError: The device cannot be used, the package is missing, or weights are missing, damaged or others.
     """
-    check_device(device)
-    return Sam2Segmenter(load_sam2(weights).to(device), device)
+    check_device(encoder.device)
+    return Sam2Segmenter(load_sam2(weights).to(encoder.device), encoder.device)

@@ -40,8 +40,8 @@ def build_sam2(side: int = SIDE) -> Any:
     Raises:
         EncoderError: The package ``transformers`` is missing or has no SAM 2.
     """
-    configuration = import_optional("transformers.models.sam2.configuration_sam2", "sam2")
-    modeling = import_optional("transformers.models.sam2.modeling_sam2", "sam2")
+    configuration = import_optional("transformers.models.sam2.configuration_sam2", "sam2", "segmenter")
+    modeling = import_optional("transformers.models.sam2.modeling_sam2", "sam2", "segmenter")
     config = configuration.Sam2Config(
         vision_config=configuration.Sam2VisionConfig(
             backbone_config=configuration.Sam2HieraDetConfig(image_size=[side, side]),

@@ -9,6 +9,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
 from fus3dmaps_core.segmenters.fastsam.proposals import MAX_PROPOSALS, masks_of, select
@@ -247,7 +248,7 @@ def test_without_its_file_it_says_how_to_make_it_and_the_licence(value, tmp_path
     (tmp_path / "folder").mkdir()
     (tmp_path / "FastSAM-s.pt").write_bytes(b"PK")
     with pytest.raises(EncoderError) as refusal:
-        load_segmenter("fastsam", "cpu", value)
+        load_segmenter("fastsam", EncoderConfig(), value)
     message = str(refusal.value)
     assert "\n" not in message
     assert message.startswith("parameter 'segmenter.weights': FastSAM: ")

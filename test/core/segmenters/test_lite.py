@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import skimage.data
 
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.encoders.lite.evidence import box_iou
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.lite import LiteSegmenter
@@ -14,7 +15,7 @@ from fus3dmaps_core.segmenters.registry import load_segmenter
 
 @pytest.fixture(scope="module")
 def segmenter() -> LiteSegmenter:
-    return load_segmenter("lite", "cpu")
+    return load_segmenter("lite", EncoderConfig())
 
 
 def best_iou(found: Masks, mask: np.ndarray) -> float:

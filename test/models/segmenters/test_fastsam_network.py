@@ -11,10 +11,12 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from stand_ins import color_trio, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config import Config, EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.query import TextQuery, answer_query
+from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
+from fus3dmaps_core.segmenters import fastsam
 from fus3dmaps_core.segmenters.registry import load_segmenter
 
 HEIGHT, WIDTH = 64, 96
@@ -76,7 +78,7 @@ def two_rectangles(height: int, width: int) -> np.ndarray:
 @pytest.mark.parametrize("size", [(HEIGHT, WIDTH), (480, 720), (32, 48)])
 def test_known_rectangles_are_found_end_to_end(size, tmp_path):
     height, width = size
-    segmenter = load_segmenter("fastsam", "cpu", str(write_network(tmp_path / "mine.onnx")))
+    segmenter = load_segmenter("fastsam", EncoderConfig(), str(write_network(tmp_path / "mine.onnx")))
     found = segmenter.segment(two_rectangles(height, width), np.zeros(size, np.float32))
     assert found.masks.shape == (2, height, width)
     left, right = (
@@ -90,7 +92,7 @@ def test_known_rectangles_are_found_end_to_end(size, tmp_path):
 
 
 def test_480x640_is_letterboxed_and_the_masks_lie_where_the_objects_are(tmp_path):
-    segmenter = load_segmenter("fastsam", "cpu", str(write_network(tmp_path / "mine.onnx")))
+    segmenter = load_segmenter("fastsam", EncoderConfig(), str(write_network(tmp_path / "mine.onnx")))
     rgb = np.zeros((480, 640, 3), np.uint8)
     rgb[120:240, 120:240] = 255
     found = segmenter.segment(rgb, np.zeros((480, 640), np.float32))
@@ -102,7 +104,7 @@ def test_480x640_is_letterboxed_and_the_masks_lie_where_the_objects_are(tmp_path
 
 
 def test_nothing_found_and_the_same_from_several_threads(tmp_path):
-    segmenter = load_segmenter("fastsam", "cpu", str(write_network(tmp_path / "mine.onnx")))
+    segmenter = load_segmenter("fastsam", EncoderConfig(), str(write_network(tmp_path / "mine.onnx")))
     depth = np.zeros((HEIGHT, WIDTH), np.float32)
     empty = segmenter.segment(np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth)
     assert empty.masks.shape == (0, HEIGHT, WIDTH)
@@ -133,9 +135,33 @@ def test_it_is_found_in_a_directory_and_in_the_cache(name, tmp_path, monkeypatch
     folder.mkdir(parents=True)
     write_network(folder / f"{name}.onnx")
     for value in (str(folder), ""):
-        assert (
-            len(load_segmenter("fastsam", "cpu", value).segment(two_rectangles(64, 96), np.zeros((64, 96), np.float32))) == 2
-        )
+        segmenter = load_segmenter("fastsam", EncoderConfig(), value)
+        assert len(segmenter.segment(two_rectangles(64, 96), np.zeros((64, 96), np.float32))) == 2
+
+
+@pytest.mark.parametrize(("precision", "is_rounded"), [("fp32", False), ("fp16", True), ("bf16", True)])
+def test_tensorrt_runs_it_in_the_precision_of_the_encoders(precision, is_rounded, tmp_path, monkeypatch):
+    path, asked = write_network(tmp_path / "mine.onnx"), []
+
+    def open_network(*options):
+        asked.append(options)
+        return OnnxNetwork(options[0], "cpu")
+
+    monkeypatch.setattr(fastsam, "check_cuda", lambda device: None)
+    monkeypatch.setattr(fastsam, "open_network", open_network)
+    encoder = EncoderConfig(runtime="tensorrt", precision=precision, graph_directory=str(tmp_path / "graphs"))
+    segmenter = load_segmenter("fastsam", encoder, str(path))
+    ((run, device, runtime, said, directory),) = asked
+    assert (device, runtime, said, directory) == ("cpu", "tensorrt", precision, tmp_path / "graphs")
+    assert (run != path) == is_rounded
+    assert run.parent == (directory if is_rounded else tmp_path)
+    assert len(segmenter.segment(two_rectangles(64, 96), np.zeros((64, 96), np.float32))) == 2
+
+
+def test_tensorrt_on_the_cpu_is_refused_by_name(tmp_path):
+    path = write_network(tmp_path / "mine.onnx")
+    with pytest.raises(EncoderError, match=r"tensorrt runs on CUDA devices alone, 'encoder.device' is 'cpu'"):
+        load_segmenter("fastsam", EncoderConfig(runtime="tensorrt"), str(path))
 
 
 @pytest.mark.parametrize(
@@ -155,7 +181,7 @@ def test_another_network_is_refused_by_what_it_takes_and_gives(other, tmp_path):
     with pytest.raises(
         EncoderError, match=r"^parameter 'segmenter\.weights': FastSAM: .*other\.onnx' is another network"
     ) as found:
-        load_segmenter("fastsam", "cpu", str(path))
+        load_segmenter("fastsam", EncoderConfig(), str(path))
     assert "\n" not in str(found.value)
 
 
@@ -163,5 +189,5 @@ def test_a_file_that_is_cut_short_is_refused(tmp_path):
     path = tmp_path / "FastSAM-s.onnx"
     path.write_bytes(write_network(tmp_path / "whole.onnx").read_bytes()[:-500])
     with pytest.raises(EncoderError, match=r"^parameter 'segmenter\.weights': FastSAM: .*cut short") as found:
-        load_segmenter("fastsam", "cpu", str(path))
+        load_segmenter("fastsam", EncoderConfig(), str(path))
     assert "\n" not in str(found.value)

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import save_file
 from transformers import Sam2ImageProcessor, Sam2VideoConfig, Sam2VideoModel
 
+from fus3dmaps_core.config import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.registry import load_segmenter
 from fus3dmaps_core.segmenters.sam2.network import build_sam2, load_sam2
@@ -58,7 +59,7 @@ def test_the_architecture_is_the_published_one(network, published):
 def test_the_weights_of_the_published_file_are_those_that_run(published, directory):
     loaded = load_sam2(str(directory), SIDE).state_dict()
     assert all(torch.equal(value, published[name]) for name, value in loaded.items())
-    segmenter = load_segmenter("sam2", "cpu", str(directory / "model.safetensors"))
+    segmenter = load_segmenter("sam2", EncoderConfig(), str(directory / "model.safetensors"))
     assert isinstance(segmenter, Sam2Segmenter)
 
 
@@ -83,7 +84,7 @@ def test_weights_of_another_network_are_refused(published, tmp_path, change, com
 
 def test_without_weights_it_says_what_to_download_and_where_to_put_it(tmp_path):
     with pytest.raises(EncoderError) as refusal:
-        load_segmenter("sam2", "cpu", str(tmp_path))
+        load_segmenter("sam2", EncoderConfig(), str(tmp_path))
     message = str(refusal.value)
     assert message.startswith("parameter 'segmenter.weights': SAM 2.1 Hiera tiny: ")
     assert "https://huggingface.co/facebook/sam2.1-hiera-tiny/resolve/main/model.safetensors" in message
