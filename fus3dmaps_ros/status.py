@@ -53,6 +53,8 @@ def status_message(
     message = MapperStatus(
         header=header,
         state=state,
+        encoder=config.encoder.name,
+        segmenter=config.segmenter.name,
         topics=list(rates_hz),
         rates_hz=[float(rate_hz) for rate_hz in rates_hz.values()],
         drop_reasons=sorted(drops),
@@ -63,6 +65,7 @@ def status_message(
         problems=list(problems),
     )
     if session is not None:
+        message.encoder = session.pipeline.trio.name
         counts, times = session.worker.counts(), session.worker.stage_times()
         message.frames, message.not_keyframes = counts.frames, counts.not_keyframes
         message.dense_keyframes, message.instance_keyframes = counts.dense_keyframes, counts.instance_keyframes

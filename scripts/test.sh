@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Sets up, then checks style and types and runs every test. With arguments only pytest runs, and gets them:
+# Sets up, then checks style and types and runs every test; those that need the extra "models" in an environment of their own
+# (scripts/test_models.sh), which is made once. With arguments only pytest runs, in the base environment, and gets them:
 #   scripts/test.sh                       everything
 #   scripts/test.sh test/core -k voxel    some tests
 set -euo pipefail
@@ -28,6 +29,7 @@ check "ruff check" ruff check
 check "ruff format" ruff format --check
 check "mypy" mypy
 check "pytest" python -m pytest -q --durations=5
+check "pytest, extra models" bash scripts/test_models.sh -q --durations=5
 if ((${#failed[@]})); then
     printf -v list '%s, ' "${failed[@]}"
     printf 'failed: %s\n' "${list%, }" >&2

@@ -13,6 +13,8 @@ PROMISED = {
     MapperStatus: {
         "header": "std_msgs/Header",
         "state": "string",
+        "encoder": "string",
+        "segmenter": "string",
         "topics": "sequence<string>",
         "rates_hz": "sequence<float>",
         "frames": "uint64",

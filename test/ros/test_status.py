@@ -28,6 +28,7 @@ def test_the_status_tells_what_came_what_was_lost_and_what_the_map_takes(make_ro
     semantic_map = robot.mapper.pipeline.semantic_map
     assert status.state == "active"
     assert status.header.frame_id == "map"
+    assert (status.encoder, status.segmenter) == ("stand_in", "lite")
     rates_hz = dict(zip(status.topics, status.rates_hz, strict=True))
     assert rates_hz.keys() == {"rgb/image", "depth/image", "rgb/camera_info", "pose"}
     assert all(rate_hz > 0 for rate_hz in rates_hz.values())

@@ -106,6 +106,7 @@ def test_a_node_maps_a_replay_and_keeps_to_its_own_maps(start, user, signals, ca
     wait_until(lambda: statuses and statuses[-1].state == "active", "the node is active")
     assert play(recording, rate=10.0) == 0
     wait_until(lambda: statuses[-1].instance_keyframes == FRAMES, "the recording is mapped")
+    assert statuses[-1].encoder == name
     assert statuses[-1].dense_keyframes == statuses[-1].frames == FRAMES
     assert not any(statuses[-1].drop_counts)
 
