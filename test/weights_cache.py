@@ -1,7 +1,7 @@
 """Random weights of every large pair, where the published ones would lie on a machine that needs no network.
 
 The networks are as wide as the published ones. RADIO's transformers have four blocks, as their checkpoints may say; SigLIP's
-text towers have one block and few words, as :func:`shorten_text_towers` has the pairs expect: each prompt is embedded in
+text towers have one block and few words, as :func:`expect_random_weights` has the pairs expect: each prompt is embedded in
 eighty sentences, which takes a minute and a half through 27 blocks on two cores.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 
 import siglip2_files
 import torch
-from radio_files import PAIRS, find_checkout, write_checkpoint, write_text
+from radio_files import PAIRS, any_content, find_checkout, with_any_content, write_checkpoint, write_text
 
 from fus3dmaps_core.encoders import siglip2
 from fus3dmaps_core.encoders.clip_dinoiser import network as clip_dinoiser
@@ -37,33 +37,28 @@ class WeightsCache:
 
     Attributes:
         environment: Variables under which a process finds them as it finds published ones.
-        parameters: By pair, what has to be said besides its name. Files whose hash is known cannot be made of random
-            numbers; these are files of one's own, under another name.
     """
 
     environment: dict[str, str]
-    parameters: dict[str, dict[str, str]]
 
 
-def shorten_text_towers(set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
-    """Have the pairs expect text towers of one block, in this process."""
+def expect_random_weights(set_attribute: Callable[[Any, str, Any], None] = setattr) -> None:
+    """Have the pairs of this process take files of any content where they know a hash, and text towers of one block."""
     for module, attribute in ((naradio, "NARADIO"), (radseg, "RADSEG")):
-        set_attribute(module, attribute, _with_short_text(getattr(module, attribute)))
+        set_attribute(module, attribute, _with_short_text(with_any_content(getattr(module, attribute))))
     set_attribute(siglip2, "TEXT", _short(siglip2.TEXT))
+    set_attribute(siglip2, "MODEL", any_content(siglip2.MODEL))
+    set_attribute(clip_dinoiser, "HEADS", any_content(clip_dinoiser.HEADS))
 
 
 def write_weights(root: Path) -> WeightsCache:
     """Write random weights of all pairs, always the same ones."""
-    environment = {"XDG_CACHE_HOME": str(root), "TORCH_HOME": str(root / "torch"), "HF_HOME": str(root / "hub")}
-    own = {name: root / "own" / name for name in ("clip_dinoiser", "siglip2")}
-    for folder in own.values():
-        folder.mkdir(parents=True)
     torch.manual_seed(17)
     with torch.inference_mode():
         _write_radio(root)
-        _write_clip_dinoiser(own["clip_dinoiser"])
-        siglip2_files.write_directory(own["siglip2"], siglip2_files.random_model(384, _short(siglip2.TEXT)))
-    return WeightsCache(environment, {name: {"encoder.weights": str(folder)} for name, folder in own.items()})
+        _write_clip_dinoiser(root)
+        _write_siglip2(root)
+    return WeightsCache({"XDG_CACHE_HOME": str(root), "TORCH_HOME": str(root / "torch"), "HF_HOME": str(root / "hub")})
 
 
 def _short(tower: TextTower) -> TextTower:
@@ -87,12 +82,19 @@ def _write_radio(root: Path) -> None:
             shutil.move(root / file.file_name, _place(root, file))
 
 
-def _write_clip_dinoiser(folder: Path) -> None:
+def _write_clip_dinoiser(root: Path) -> None:
     from safetensors.torch import save_file
 
-    save_file(clip_dinoiser.build_clip().state_dict(), folder / "open_clip_model.safetensors")
-    # Under the published name, last.pt, it would need the published hash.
-    save_file(DinoiserHeads().state_dict(), folder / "last.safetensors")
+    save_file(clip_dinoiser.build_clip().state_dict(), _place(root, clip_dinoiser.CLIP))
+    torch.save(DinoiserHeads().state_dict(), _place(root, clip_dinoiser.HEADS))
+
+
+def _write_siglip2(root: Path) -> None:
+    from safetensors.torch import save_file
+
+    model = siglip2_files.random_model(384, _short(siglip2.TEXT))
+    save_file(siglip2_files.published_state(model), _place(root, siglip2.MODEL))
+    siglip2_files.write_tokenizer(_place(root, siglip2.TOKENIZER))
 
 
 def _place(root: Path, file: WeightFile) -> Path:

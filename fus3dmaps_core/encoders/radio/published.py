@@ -15,7 +15,7 @@ RADIO_LARGE = WeightFile(
     url="https://huggingface.co/nvidia/RADIO/resolve/main/radio-v2.5-l_half.pth.tar",
     hub="nvidia/RADIO",
     revision="main",
-    sha256="",
+    sha256="50324e8cb086885126a896ad9ecbac46355cf0e4c1d8363763b01693a4618ff1",
     licence="NVIDIA Source Code License for RADIO (research and evaluation only)",
 )
 
@@ -30,23 +30,35 @@ C_RADIO_BASE = WeightFile(
 )
 
 
-def _file(title: str, repository: str, name: str) -> WeightFile:
+def _file(title: str, repository: tuple[str, str], name: str, sha256: str = "") -> WeightFile:
+    hub, revision = repository
     return WeightFile(
         title=title,
         file_name=name,
-        url=f"https://huggingface.co/{repository}/resolve/main/{name}",
-        hub=repository,
-        revision="main",
-        sha256="",
+        url=f"https://huggingface.co/{hub}/resolve/{revision}/{name}",
+        hub=hub,
+        revision=revision,
+        sha256=sha256,
         licence="Apache-2.0",
     )
 
 
-_SIGLIP, _SIGLIP2 = "google/siglip-so400m-patch14-384", "google/siglip2-so400m-patch16-naflex"
+_SIGLIP = ("google/siglip-so400m-patch14-384", "9fdffc58afc957d1a03a25b10dba0329ab15c2a3")
+_SIGLIP2 = ("google/siglip2-so400m-patch16-naflex", "cc24074f717b612951c2dead130904ab9b65a81e")
 
 SIGLIP = TextTower(
-    weights=_file("SigLIP SO400M model", _SIGLIP, "model.safetensors"),
-    tokenizer=_file("SigLIP SO400M tokenizer", _SIGLIP, "tokenizer.json"),
+    weights=_file(
+        "SigLIP SO400M model",
+        _SIGLIP,
+        "model.safetensors",
+        "ea2abad2b7f8a9c1aa5e49a244d5d57ffa71c56f720c94bc5d240ef4d6e1d94a",
+    ),
+    tokenizer=_file(
+        "SigLIP SO400M tokenizer",
+        _SIGLIP,
+        "tokenizer.json",
+        "c6e405cb7c670d56636a9402c81023a55bc6c3c53d89cf02b92f5c5005bfe920",
+    ),
     vocabulary=32_000,
     end_id=1,
     pad_id=1,

@@ -11,7 +11,7 @@ SAM2 = WeightFile(
     file_name="model.safetensors",
     url="",
     hub="facebook/sam2.1-hiera-tiny",
-    revision="main",
+    revision="de431c4043854a71d8101e17995dfe596bf101a5",
     sha256="",
     licence="Apache-2.0",
 )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from ros.conftest import signals, start, user  # noqa: F401  (fixtures)
-from weights_cache import WeightsCache, shorten_text_towers, write_weights
+from weights_cache import WeightsCache, expect_random_weights, write_weights
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.recordings.writer import RecordingWriter
@@ -51,11 +51,11 @@ def maps(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def parameters(cache, maps) -> Callable[[str], dict[str, object]]:
+def parameters(maps) -> Callable[[str], dict[str, object]]:
     """Every parameter of a node or pipeline with the pair of a name."""
 
     def of_pair(name: str) -> dict[str, object]:
-        return {**SETTINGS, "node.map_directory": str(maps), "encoder.name": name, **cache.parameters.get(name, {})}
+        return {**SETTINGS, "node.map_directory": str(maps), "encoder.name": name}
 
     return of_pair
 
@@ -66,7 +66,7 @@ def cached(cache, monkeypatch) -> None:
     for variable, value in cache.environment.items():
         monkeypatch.setenv(variable, value)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(Path(cache.environment["HF_HOME"]) / "hub"))
-    shorten_text_towers(monkeypatch.setattr)
+    expect_random_weights(monkeypatch.setattr)
 
 
 @pytest.fixture(scope="session")

@@ -11,17 +11,18 @@ from urllib.error import URLError
 import numpy as np
 import pytest
 import torch
-from radio_files import write_checkpoint
+from radio_files import PAIRS, with_any_content, write_checkpoint
 
 from fus3dmaps_core.encoders.radio import checkout as checkout_module
 from fus3dmaps_core.encoders.radio.checkout import find_checkout, import_from
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
-from fus3dmaps_core.encoders.radio.pair import default_dtype, load_networks, load_trio
+from fus3dmaps_core.encoders.radio.pair import default_dtype, load_networks, load_text_encoder, load_trio
 from fus3dmaps_core.encoders.radio.published import REVISION
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
-from fus3dmaps_core.encoders.registry import load_text_encoder, names
 from fus3dmaps_core.encoders.registry import load_trio as load_by_name
+from fus3dmaps_core.encoders.registry import names
+from fus3dmaps_core.encoders.weights import find_weights
 from fus3dmaps_core.errors import EncoderError
 
 
@@ -181,13 +182,22 @@ def test_a_damaged_file_of_the_text_tower_is_named(loaded, tmp_path, name):
         shutil.copy(loaded.folder / file, tmp_path)
     (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:100])
     with pytest.raises(EncoderError, match=name):
-        load_text_encoder(loaded.pair.name, "cpu", str(tmp_path))
+        load_text_encoder(loaded.pair, "cpu", str(tmp_path))
 
 
 def test_another_text_tower_is_refused(loaded):
-    """The registry's pair wants the published tower, which the narrow one is not."""
+    """The pair itself wants the published tower, which the narrow one is not."""
     with pytest.raises(EncoderError, match="another architecture than SiglipTextModel"):
-        load_text_encoder(loaded.pair.name, "cpu", str(loaded.folder))
+        load_text_encoder(with_any_content(PAIRS[loaded.pair.name]), "cpu", str(loaded.folder))
+
+
+def test_files_of_a_published_name_and_hash_must_be_the_published_ones(loaded):
+    published = PAIRS[loaded.pair.name]
+    with_hash = [file for file in (published.radio, published.text.weights, published.text.tokenizer) if file.sha256]
+    assert len(with_hash) == {"naradio": 3, "radseg": 0}[loaded.pair.name]
+    for known in with_hash:
+        with pytest.raises(EncoderError, match=rf"altered or incomplete, its sha256 is .*not {known.sha256}"):
+            find_weights("encoder.weights", str(loaded.folder), known)
 
 
 @pytest.mark.parametrize("device", ["cuda:99", "abacus"])
@@ -216,7 +226,7 @@ def test_the_published_transformers_run_at_full_width(checkout, tmp_path, rng, p
     torch.manual_seed(3)
     (tmp_path / "RADIO").symlink_to(checkout, target_is_directory=True)
     write_checkpoint(tmp_path / pair.radio.file_name, checkout, pair.name, 1520, 3, model)
-    backbone, head = load_networks(pair, str(tmp_path))
+    backbone, head = load_networks(with_any_content(pair), str(tmp_path))
     (tmp_path / pair.radio.file_name).unlink()
     assert sum(parameter.numel() for parameter in backbone.parameters()) == parameters
     with torch.inference_mode():
