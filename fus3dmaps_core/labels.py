@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.encoders.protocols import TextEncoder
 from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.query import check_layer, check_texts
+from fus3dmaps_core.query import check_layer, check_space, check_texts
 from fus3dmaps_core.semantic_map import SemanticMap
 
 DEFAULT_LABEL_LAYER = "fused_dense"
@@ -45,12 +45,14 @@ def label_voxels(
         layer: One of LAYERS.
 
     Raises:
-        QueryError: A name is empty or too long, the layer is unknown or empty; the message names the field.
+        QueryError: A name is empty or too long, the layer is unknown or empty, or the encoder is another trio's; the message
+            names the field.
     """
     if not labels:
         raise QueryError("labels: at least one label is needed")
     check_texts("labels", labels)
     check_layer(layer)
+    check_space(semantic_map, text_encoder)
     if semantic_map.voxel_count == 0:
         raise QueryError("the map is empty: nothing has been mapped yet")
     found = semantic_map.label(layer, text_encoder.encode_text(labels))

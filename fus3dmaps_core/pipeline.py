@@ -83,6 +83,7 @@ class Pipeline:
             _variance_ratio(config, trio),
             config.fusion.window_radius_m,
             config.fusion.keep_most_evidence,
+            trio.name,
         )
         gates = config.keyframes
         self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
@@ -246,6 +247,7 @@ class Pipeline:
             _variance_ratio(self.config, self.trio),
             self.config.fusion.window_radius_m,
             self.config.fusion.keep_most_evidence,
+            self.trio.name,
         )
 
     def restore(self, semantic_map: SemanticMap, stamp_ns: int, camera_poses: NDArray[np.float64]) -> None:

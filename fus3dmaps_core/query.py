@@ -76,6 +76,17 @@ def check_layer(layer: str) -> None:
         raise QueryError(f"layer: unknown layer '{layer}', known are {', '.join(LAYERS)}")
 
 
+def check_space(semantic_map: SemanticMap, text_encoder: TextEncoder) -> None:
+    """Raise QueryError, naming both trios, if the map holds embeddings of another trio than the encoder's.
+
+    Spaces of equal width mean different things by the same numbers: their cosines would rank, and say nothing.
+    """
+    if semantic_map.space and text_encoder.space != semantic_map.space:
+        raise QueryError(
+            f"prompts: they are embedded by encoder '{text_encoder.space}', the map was built with '{semantic_map.space}'"
+        )
+
+
 @dataclass(frozen=True)
 class RankedInstance:
     """An instance as the answer to a prompt.
@@ -125,9 +136,11 @@ def answer_query(semantic_map: SemanticMap, text_encoder: TextEncoder, query: Te
     exp(s c) / (exp(s c) + exp(s c_negative)), s being the logit scale and c the cosines.
 
     Raises:
-        QueryError: The query is malformed or the layer is empty; the message names the field.
+        QueryError: The query is malformed, the layer is empty, or the encoder is another trio's; the message names the field
+            or both trios.
     """
     query.check()
+    check_space(semantic_map, text_encoder)
     _check_not_empty(semantic_map)
     texts = text_encoder.encode_text([*query.prompts, *query.negative_prompts])
     count = len(query.prompts)
@@ -170,9 +183,10 @@ def answer_image_query(
         logit_scale: Factor of the cosines where there are negative prompts.
 
     Raises:
-        QueryError: The query is malformed or the layer is empty; the message names the field.
+        QueryError: As :func:`answer_query`.
     """
     query.check()
+    check_space(semantic_map, text_encoder)
     _check_not_empty(semantic_map)
     negative = text_encoder.encode_text(query.negative_prompts) if query.negative_prompts else embedding[:0]
     return _answer(semantic_map, query, embedding, negative, logit_scale)

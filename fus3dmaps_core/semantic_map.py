@@ -39,7 +39,12 @@ from fus3dmaps_core.snapshots import FusionReport, InstanceSnapshot, VoxelSnapsh
 
 
 class SemanticMap:
-    """A voxel map with a dense and an instance layer, thread-safe."""
+    """A voxel map with a dense and an instance layer, thread-safe.
+
+    Attributes:
+        dimension: Embedding width d.
+        space: Name of the encoder trio whose embeddings it holds, "" where nobody said; queries of another are refused.
+    """
 
     def __init__(
         self,
@@ -48,6 +53,7 @@ class SemanticMap:
         variance_ratio: float,
         window_radius_m: float = 0.0,
         keep_most_evidence: bool = True,
+        space: str = "",
     ) -> None:
         """Start empty.
 
@@ -58,11 +64,12 @@ class SemanticMap:
             window_radius_m: Radius r_w of the sliding window, metres; 0 keeps the whole dense layer and makes fusion
                 replace every fused embedding, where a window keeps those of more evidence.
             keep_most_evidence: False has fusion replace every fused embedding with a window too.
+            space: Name of the encoder trio whose embeddings will come.
 
         Raises:
             ConfigError: The kernels that the configuration names do not run here.
         """
-        self.dimension = dimension
+        self.dimension, self.space = dimension, space
         self.config = config
         self.variance_ratio = variance_ratio
         self._given_radius_m = self._radius_m = window_radius_m

@@ -6,6 +6,7 @@ manifest holds the SHA-256 of every array; nothing in it is ever unpickled. ``do
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,9 @@ __all__ = [
 ]
 
 _POSES = "camera_poses"
+
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -144,6 +148,7 @@ def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo
             manifest.variance_ratio,
             info.config.fusion.window_radius_m,
             info.config.fusion.keep_most_evidence,
+            manifest.encoder,
         )
         semantic_map.import_state(arrays)
     except (ValueError, ConfigError, MapError) as error:
@@ -174,6 +179,16 @@ def restore_map(directory: Path, semantic_map: SemanticMap, config: Config, enco
         semantic_map.import_state(arrays)
     except MapError as error:
         raise _no_map(directory, error) from None
+    was, now = info.config.encoder.weights, config.encoder.weights
+    if was != now:
+        # The same weights may lie in another place; others under the same name make another space.
+        _log.warning(
+            "map '%s' was built with encoder.weights '%s', here they are '%s': unless these are the same weights, its "
+            "objects will not be found",
+            directory,
+            was,
+            now,
+        )
     return info
 
 

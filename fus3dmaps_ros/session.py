@@ -16,11 +16,15 @@ from fus3dmaps_ros.worker import FrameWorker
 
 
 class SerialTextEncoder:
-    """A text encoder that several threads may call, one at a time: encoders need not be thread-safe."""
+    """A text encoder that several threads may call, one at a time: encoders need not be thread-safe.
+
+    Attributes:
+        space: Name of its trio.
+    """
 
     def __init__(self, encoder: TextEncoder) -> None:
         """Guard an encoder."""
-        self._encoder = encoder
+        self._encoder, self.space = encoder, encoder.space
         self._lock = threading.Lock()
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:

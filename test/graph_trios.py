@@ -126,6 +126,8 @@ class ToyCropEncoder(ToyPatchEncoder):
 
 
 class NoText:
+    space = "toy"
+
     def encode_text(self, prompts):
         return np.zeros((len(prompts), 16), np.float32)
 

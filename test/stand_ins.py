@@ -34,6 +34,8 @@ def embed(colors: np.ndarray) -> np.ndarray:
 class ColorEncoder:
     """Patch, crop and text encoder in one."""
 
+    space = "stand_in"
+
     def __init__(self) -> None:
         self.images = 0
 

@@ -58,7 +58,14 @@ class CropEncoder(Protocol):
 
 
 class TextEncoder(Protocol):
-    """Embeds prompts."""
+    """Embeds prompts.
+
+    Attributes:
+        space: Registry name of its trio; a map of another one refuses its queries.
+    """
+
+    @property
+    def space(self) -> str: ...
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
         """Embed n prompts; templates, where the trio uses them, are applied in here.

@@ -65,6 +65,9 @@ class SiglipTextEncoder:
     """Embeds prompts in templates that were made for ImageNet's class names.
 
     The unit embeddings of a prompt's sentences are averaged, and the mean is brought to unit length.
+
+    Attributes:
+        space: Name of the pair.
     """
 
     def __init__(self, tower: Any, tokenizer: Any, published: TextTower, device: str, encoder: str) -> None:
@@ -75,13 +78,13 @@ class SiglipTextEncoder:
             tokenizer: ``tokenizers.Tokenizer``.
             published: What the two are.
             device: Torch device.
-            encoder: Name of the pair, for messages.
+            encoder: Name of the pair.
 
         Raises:
             EncoderError: The package ``open_clip``, which has the templates, is missing.
         """
         self._tower, self._tokenizer, self._device = tower, tokenizer, torch.device(device)
-        self._published = published
+        self._published, self.space = published, encoder
         self._places = torch.arange(published.context, device=self._device)[None]
         metadata = import_optional("open_clip.zero_shot_metadata", encoder)
         self._templates: Sequence[Callable[[str], str]] = getattr(metadata, published.templates)

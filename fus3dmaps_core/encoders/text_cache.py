@@ -16,7 +16,11 @@ _LONGEST = 1000  # Characters of a prompt that is kept.
 
 
 class CachedTextEncoder:
-    """Embeds prompts with another encoder, each once. Safe to use from several threads if that one is."""
+    """Embeds prompts with another encoder, each once. Safe to use from several threads if that one is.
+
+    Attributes:
+        space: Name of the other's trio.
+    """
 
     def __init__(self, encoder: TextEncoder, capacity: int = _CAPACITY) -> None:
         """Keep the encoder.
@@ -25,7 +29,7 @@ class CachedTextEncoder:
             encoder: What embeds.
             capacity: Prompts that are kept; the one that was not asked for the longest time goes first.
         """
-        self._encoder, self._capacity = encoder, capacity
+        self._encoder, self._capacity, self.space = encoder, capacity, encoder.space
         self._known: OrderedDict[str, NDArray[np.float32]] = OrderedDict()
         self._lock = threading.Lock()
 

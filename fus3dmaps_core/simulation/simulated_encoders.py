@@ -129,7 +129,13 @@ class SimulatedCropEncoder:
 
 
 class SimulatedTextEncoder:
-    """Simulation of a text encoder."""
+    """Simulation of a text encoder.
+
+    Attributes:
+        space: Name of the trio.
+    """
+
+    space = NAME
 
     def __init__(self, texts: ClassTexts) -> None:
         """Answer from these texts."""

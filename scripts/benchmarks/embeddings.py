@@ -40,7 +40,13 @@ class ObservedObjects:
 
 
 class KnownText:
-    """A text encoder that answers every prompt with one vector."""
+    """A text encoder that answers every prompt with one vector.
+
+    Attributes:
+        space: That of maps which do not say whose embeddings they hold.
+    """
+
+    space = ""
 
     def __init__(self, vector: NDArray[np.float32]) -> None:
         """Hold the answer, (d,) float32."""

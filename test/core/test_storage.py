@@ -237,6 +237,14 @@ def test_a_map_that_does_not_fit_is_refused_with_both_values(
     assert_equal_states(before, running.export_state())
 
 
+@pytest.mark.parametrize(("weights", "warns"), [("", False), ("/models/mine", True)])
+def test_other_weights_under_the_same_name_are_warned_of(tmp_path: Path, rng, caplog, weights: str, warns: bool):
+    save_map(tmp_path / "m", filled_map(rng), INFO)
+    config = Config.from_flat({"encoder.weights": weights})
+    restore_map(tmp_path / "m", filled_map(rng, frames=1), config, "lite")
+    assert ("built with encoder.weights '', here they are '/models/mine'" in caplog.text) == warns
+
+
 def test_what_need_not_agree_is_not_asked_for(tmp_path: Path, rng):
     save_map(tmp_path / "m", filled_map(rng), INFO)
     config = Config.from_flat({"map.dtype": "int8", "map.iou_threshold": 0.5, "fusion.window_radius_m": 4.0})

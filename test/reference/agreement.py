@@ -188,6 +188,8 @@ def assert_same_bytes(first: dict[str, np.ndarray], second: dict[str, np.ndarray
 class KnownTexts:
     """A text encoder whose prompts are names of given vectors."""
 
+    space = "known"
+
     def __init__(self, vectors: dict[str, np.ndarray]) -> None:
         self.vectors = vectors
 

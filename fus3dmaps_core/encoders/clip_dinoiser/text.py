@@ -16,7 +16,13 @@ _BATCH = 80  # Sentences of a pass; a prompt has as many templates.
 
 
 class ClipTextEncoder:
-    """Embeds prompts with CLIP-DINOiser's templates: 80 sentences each, whose unit embeddings are averaged."""
+    """Embeds prompts with CLIP-DINOiser's templates: 80 sentences each, whose unit embeddings are averaged.
+
+    Attributes:
+        space: Name of the pair.
+    """
+
+    space = "clip_dinoiser"
 
     def __init__(self, clip: Any, device: str) -> None:
         """Keep an ``open_clip`` CLIP model, on the device already, and make its tokenizer, which comes with the package.

@@ -58,7 +58,13 @@ class ConceptSpace:
 
 
 class LiteTextEncoder:
-    """Embeds prompts into the shared space. Safe to use from several threads."""
+    """Embeds prompts into the shared space. Safe to use from several threads.
+
+    Attributes:
+        space: Name of the trio.
+    """
+
+    space = "lite"
 
     def __init__(self, model: SentenceModel, vocabulary: Vocabulary) -> None:
         """Keep the sentence model and the mean to subtract."""

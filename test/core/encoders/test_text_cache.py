@@ -15,6 +15,8 @@ from fus3dmaps_core.encoders.text_cache import CachedTextEncoder
 class Counting:
     """Embeds a prompt by its characters, and remembers what it was asked."""
 
+    space = "characters"
+
     def __init__(self) -> None:
         self.asked: list[list[str]] = []
 
@@ -43,6 +45,7 @@ def test_answers_are_those_of_the_encoder_whatever_was_asked_before(calls, capac
 def test_a_prompt_is_embedded_once_and_new_ones_together():
     encoder = Counting()
     cached = CachedTextEncoder(encoder)
+    assert cached.space == "characters"
     cached.encode_text(["mug", "sink", "mug"])
     cached.encode_text(["bed", "mug", "chair"])
     cached.encode_text(["chair", "sink"])

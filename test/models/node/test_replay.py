@@ -15,8 +15,8 @@ from node_process import RELIABLE_ARGUMENTS, end
 from reference.agreement import assert_same_bytes
 from robot import TIMEOUT_S, wait_until
 
-from fus3dmaps_core.encoders.registry import card, names
-from fus3dmaps_core.errors import StorageError
+from fus3dmaps_core.encoders.registry import card, load_text_encoder, names
+from fus3dmaps_core.errors import QueryError, StorageError
 from fus3dmaps_core.offline import map_info, map_recording
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.query import LAYERS, TextQuery, answer_query
@@ -80,7 +80,7 @@ def test_a_recording_gives_the_same_map_twice(cached, recording, config, offline
     embedding = pipeline.trio.text.encode_text([PROMPT])
     assert embedding.shape == (1, card(name).dimension)
     np.testing.assert_allclose(np.linalg.norm(embedding), 1, atol=1e-5)
-    text = SimpleNamespace(encode_text=lambda prompts: embedding)  # Eighty sentences, once.
+    text = SimpleNamespace(space=name, encode_text=lambda prompts: embedding)  # Eighty sentences, once.
     for layer in LAYERS:
         answer = answer_query(pipeline.semantic_map, text, TextQuery([PROMPT], layer=layer), pipeline.trio.logit_scale)
         assert len(answer.points_m)
@@ -140,6 +140,14 @@ def test_a_saved_map_is_asked_in_the_words_of_its_own_pair(offline, config, monk
         cli.main()
     assert not ended.value.code
     assert len(json.loads(capsys.readouterr().out))
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_a_saved_map_refuses_the_words_of_another_pair(cached, offline, name):
+    other = another_than(name)
+    semantic_map, info = load_map(offline(name))
+    with pytest.raises(QueryError, match=rf"embedded by encoder '{other}', the map was built with '{name}'"):
+        answer_query(semantic_map, load_text_encoder(other, "cpu"), TextQuery([PROMPT]), info.logit_scale)
 
 
 @pytest.mark.parametrize("name", PAIRS)
