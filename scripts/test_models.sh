@@ -3,6 +3,7 @@
 # to pytest:
 #   scripts/test_models.sh                everything
 #   scripts/test_models.sh -k naradio     some tests
+#   scripts/test_models.sh --environment-only   none: makes the environment, where it is not up to date
 # The packages of the extra go into .venv-models beside this folder, pinned by constraints-models.txt and installed at the
 # first run (about a minute and 5 GB, nearly all of it torch for CUDA, to which PyPI's torchvision is bound). All else, ROS and
 # the package itself too, it takes from .venv, which is set up first and stays as it is.
@@ -107,6 +108,7 @@ if ! is_made; then
     lock -s
 fi
 
+[[ ${1:-} != --environment-only ]] || exit 0
 export PATH=$VENV/bin:$BASE/bin:$PATH
 cd -- "$ROOT"
 (($#)) || set -- -q

@@ -78,6 +78,13 @@ def test_the_environment_is_made_once_and_arguments_go_to_pytest(machine):
     assert machine.noted("pip") == [f"pip in {machine.root}/.venv-models/bin/python"]
 
 
+def test_the_environment_alone_can_be_made(machine):
+    code, output = machine.run("--environment-only")
+    assert code == 0, output
+    assert len(machine.noted("pip")) == 1
+    assert not machine.noted("pytest")
+
+
 def test_it_is_made_anew_for_other_pins_another_base_and_another_place(machine, tmp_path):
     machine.run()
     machine.constraints.write_text("timm==1.1\n")
