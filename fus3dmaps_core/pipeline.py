@@ -22,6 +22,7 @@ from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sampl
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.memory_budget import KeyframeBound, MemoryBudget
 from fus3dmaps_core.runtimes.acceleration import accelerate
+from fus3dmaps_core.runtimes.image_memory import naming_image_size
 from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
@@ -126,15 +127,16 @@ class Pipeline:
         budget is made before the map grows, so that a frame that fails half-way cannot take more than was planned.
 
         Raises:
-            EncoderError: An encoder or the segmenter has not enough memory for a single image.
+            EncoderError: There is not enough memory for a single image of the configured size.
         """
         T = frame.T_world_camera
         report = FrameReport(frame.stamp_ns, self._dense_gate.wants(T), self._instance_gate.wants(T))
         report.window_radius_m = self.semantic_map.window_radius_m
         if not (report.dense or report.instances):
             return report
-        with report.timed("resize"):
-            working = resize_frame(frame, self.config.image)
+        image = self.config.image
+        with report.timed("resize"), naming_image_size(self.trio.name, image.height, image.width):
+            working = resize_frame(frame, image)
         if self.config.map.memory_budget_mib > 0:
             with report.timed("memory"):
                 report.dropped_dense_voxels = self._budget.make_room(self.semantic_map, T[:3, 3])

@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from fus3dmaps_core.config import Config
 from fus3dmaps_core.datasets.registry import names as dataset_names
 from fus3dmaps_core.errors import ConfigError, Fus3dmapsError, RecordingError
+from fus3dmaps_ros.settings import DatasetOptions, ParamsFile, Settings, configuration, directory, pairs
 
 if TYPE_CHECKING:
     from fus3dmaps_core.frame import PosedFrame
@@ -33,9 +32,6 @@ app = typer.Typer(
 _log = Console(stderr=True, highlight=False)
 _out = Console(highlight=False)
 
-ParamsFile = Annotated[Path | None, typer.Option("--params-file", help="YAML file of parameters, as for the node.")]
-Settings = Annotated[list[str] | None, typer.Option("--set", help="A parameter, e.g. map.voxel_size_m=0.1; repeatable.")]
-DatasetOptions = Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11; repeatable.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what is there.")]
 
 
@@ -63,7 +59,7 @@ def convert(
 
     with _progress("writing frames") as update:
         summary = convert_dataset(
-            dataset, directory, out, overwrite=overwrite, on_progress=update, options=_pairs("--option", options)
+            dataset, directory, out, overwrite=overwrite, on_progress=update, options=pairs("--option", options)
         )
     _out.print(
         f"{out}: {summary.frames} frames, {summary.duration_s:.1f} s of recording, {summary.size_bytes / 1e6:.0f} MB",
@@ -75,7 +71,7 @@ def convert(
 @app.command(name="map")
 def map_(
     bag: Annotated[Path, typer.Argument(help="rosbag2 directory or MCAP file.")],
-    out: Annotated[Path, typer.Option("--out", help="Directory for the map.")],
+    out: Annotated[Path, typer.Option("--out", parser=directory, metavar="DIRECTORY", help="Directory for the map.")],
     params_file: ParamsFile = None,
     settings: Settings = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the run's figures to this file.")] = None,
@@ -85,7 +81,7 @@ def map_(
     from fus3dmaps_core.pipeline import Pipeline
     from fus3dmaps_core.storage import check_map_target, save_map
 
-    config = _config(params_file, settings)
+    config = configuration(params_file, settings)
     check_map_target(out)
     with _log.status("loading models"):
         pipeline = Pipeline.from_config(config)
@@ -271,8 +267,8 @@ def evaluate(
     """Measure how good maps are: on simulated buildings, or on a labelled dataset."""
     from fus3dmaps_ros.evaluate_command import Destination, Evaluation, evaluate_target
 
-    request = Evaluation(target, directory, seeds, quick, jobs, _pairs("--option", options))
-    evaluate_target(request, _config(params_file, settings), Destination(json_file, report, _out), _progress)
+    request = Evaluation(target, directory, seeds, quick, jobs, pairs("--option", options))
+    evaluate_target(request, configuration(params_file, settings), Destination(json_file, report, _out), _progress)
 
 
 @app.command()
@@ -285,7 +281,7 @@ def encoders(
     """List the encoders: their space, their licences, and what of them is installed."""
     from fus3dmaps_ros.encoders_command import list_encoders
 
-    config = _config(params_file, settings)
+    config = configuration(params_file, settings)
     if weights is not None:
         config = config.with_values({"encoder.weights": weights})
     list_encoders(config, _out, as_json=as_json)
@@ -293,7 +289,15 @@ def encoders(
 
 @app.command()
 def export(
-    out: Annotated[Path, typer.Option("--out", help="Directory for graphs and engines; later encoder.graph_directory.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            parser=directory,
+            metavar="DIRECTORY",
+            help="Directory for graphs and engines; later encoder.graph_directory.",
+        ),
+    ],
     encoder: Annotated[str | None, typer.Option("--encoder", help="Which encoders; the same as encoder.name.")] = None,
     precision: Annotated[str | None, typer.Option("--precision", help="fp32, fp16 or bf16; as encoder.precision.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
@@ -304,7 +308,9 @@ def export(
     from fus3dmaps_ros.export_command import export_encoders
 
     chosen = {"encoder.name": encoder, "encoder.precision": precision}
-    config = _config(params_file, settings).with_values({key: value for key, value in chosen.items() if value is not None})
+    config = configuration(params_file, settings).with_values(
+        {key: value for key, value in chosen.items() if value is not None}
+    )
     export_encoders(config, out, _out, as_json=as_json)
 
 
@@ -312,7 +318,9 @@ def export(
 def demo(
     recording: Annotated[Path | None, typer.Argument(help="Recording to use instead of the simulated room.")] = None,
     prompts: Annotated[list[str] | None, typer.Argument(metavar="PROMPT...", help="What to ask.")] = None,
-    out: Annotated[Path, typer.Option("--out", help="Directory for pictures and logs.")] = Path("out/demo"),
+    out: Annotated[
+        Path, typer.Option("--out", parser=directory, metavar="DIRECTORY", help="Directory for pictures and logs.")
+    ] = Path("out/demo"),
 ) -> None:
     """Play a recording into a mapper node, ask it for things and draw the answers."""
     _need_ros()
@@ -320,22 +328,6 @@ def demo(
 
     if not run_demo(recording, prompts or (), out, _out):
         sys.exit(1)
-
-
-def _config(params_file: Path | None, settings: list[str] | None) -> Config:
-    config = Config() if params_file is None else Config.from_yaml(params_file)
-    values = {key: yaml.safe_load(text) for key, text in _pairs("--set", settings).items()}
-    return config.with_values(values)
-
-
-def _pairs(option: str, settings: list[str] | None) -> dict[str, str]:
-    values: dict[str, str] = {}
-    for setting in settings or ():
-        key, equals, text = setting.partition("=")
-        if not equals:
-            raise ConfigError(f"{option} {setting}: expected key=value")
-        values[key.strip()] = text
-    return values
 
 
 def _print_answer(instances: Sequence[RankedInstance], prompts: Sequence[str], frame: str, as_json: bool) -> None:

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from fus3dmaps_core.config import Config
+from fus3dmaps_core.encoders import registry
 from fus3dmaps_core.encoders.catalogue import Entry, Part, catalogue
 
 _HEADINGS = ("name", "d", "λ", "patches", "code", "weights", "installed")
@@ -27,8 +28,10 @@ def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
         as_json: Print a JSON list in place of the table.
 
     Raises:
-        EncoderError: ``encoder.weights`` names neither a file or directory nor a repository.
+        EncoderError: ``encoder.weights`` names neither a file or directory nor a repository, or ``encoder.name`` no encoder.
     """
+    if config.encoder.name not in registry.names():
+        registry.card(config.encoder.name)  # Refuses it, with the names that are known.
     entries = catalogue(config.encoder.weights, config.encoder.name)
     size = config.image.height, config.image.width
     if as_json:

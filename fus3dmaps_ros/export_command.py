@@ -31,17 +31,19 @@ def export_encoders(config: Config, directory: Path, console: Console, *, as_jso
         as_json: Print one JSON object, ``graphs`` and ``engines``, in place of lines.
 
     Raises:
-        EncoderError: The trio or its weights are missing, an encoder has no graph, the directory cannot be written, or a
-            graph is too far from torch.
+        EncoderError: The trio or its weights are missing, an encoder has no graph, the directory cannot be written, memory
+            does not suffice for images of that size, or a graph is too far from torch.
     """
     # Seconds of import, which only those who export pay.
     from fus3dmaps_core.encoders.registry import load_trio
     from fus3dmaps_core.runtimes.exporting import export_graph, graph_encoders
+    from fus3dmaps_core.runtimes.image_memory import naming_image_size
 
     encoder, image, exported = config.encoder, config.image, []
     trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
     for named in graph_encoders(trio):
-        exported.append(export_graph(named, encoder.precision, directory, image.height, image.width))
+        with naming_image_size(trio.name, image.height, image.width):
+            exported.append(export_graph(named, encoder.precision, directory, image.height, image.width))
         if not as_json:
             _say(console, _graph_line(exported[-1]))
     engines, note = _build_engines(encoder, directory, exported)

@@ -14,6 +14,8 @@ def check_device(device: str) -> None:
         EncoderError: Torch does not know it, or there is none.
     """
     try:
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:  # Torch asserts where it was built without CUDA.
-        raise EncoderError(f"parameter 'encoder.device': torch cannot use '{device}': {error}") from None
+        torch.empty(0, device=device).cpu()  # And back: "meta" holds no values.
+    except (RuntimeError, AssertionError, ImportError) as error:  # Torch asserts where it was built without CUDA.
+        # Torch may explain itself over half a hundred lines, the first sentence of which says it.
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].partition(". ")[0]
+        raise EncoderError(f"parameter 'encoder.device': torch cannot use {device!r}: {reason}") from None

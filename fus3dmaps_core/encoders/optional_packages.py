@@ -19,11 +19,14 @@ def import_optional(module: str, name: str, kind: str = "encoder") -> ModuleType
         kind: What that is, an encoder or a segmenter.
 
     Raises:
-        EncoderError: It is not installed, or not for this torch; the message names the extra that has it.
+        EncoderError: It is not installed, or not for this torch; the message names the parameter that chose it, and
+            the extra that has it.
     """
+    needs = f"parameter '{kind}.name': {kind} '{name}'"
     try:
         return import_module(module)
     except ImportError as error:
-        raise EncoderError(f"{kind} '{name}' needs '{error.name or module}', which is not installed; use {EXTRA}") from None
+        raise EncoderError(f"{needs} needs '{error.name or module}', which is not installed; use {EXTRA}") from None
     except (RuntimeError, OSError, AttributeError) as error:  # So torchvision fails beside another torch than its own.
-        raise EncoderError(f"{kind} '{name}': cannot import '{module}' ({error}); install {EXTRA}") from None
+        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        raise EncoderError(f"{needs}: cannot import '{module}' ({reason}); install {EXTRA}") from None

@@ -58,14 +58,12 @@ class CropEncoder(Protocol):
 
 
 class TextEncoder(Protocol):
-    """Embeds prompts.
-
-    Attributes:
-        space: Registry name of its trio; a map of another one refuses its queries.
-    """
+    """Embeds prompts."""
 
     @property
-    def space(self) -> str: ...
+    def space(self) -> str:
+        """Registry name of its trio; a map of another one refuses its queries."""
+        ...
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
         """Embed n prompts; templates, where the trio uses them, are applied in here.

@@ -5,6 +5,7 @@ The encoders of several pairs live in such a tower's space; each says which one,
 
 from __future__ import annotations
 
+import logging
 import string
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -24,6 +25,9 @@ from fus3dmaps_core.errors import EncoderError
 TEXT_PREFIX = "text_model."
 """Of a tower's weights in the file of the whole model."""
 
+_log = logging.getLogger(__name__)
+
+_SLOW_PRODUCTS = 1e12  # Of a prompt, minutes on a few cores; SO400M has 2e12, the base model with its 7 templates 4e10.
 _SAFETENSORS = ".safetensors"
 _PUNCTUATION = str.maketrans("", "", string.punctuation)
 
@@ -89,6 +93,13 @@ class SiglipTextEncoder:
         metadata = import_optional("open_clip.zero_shot_metadata", encoder)
         self._templates: Sequence[Callable[[str], str]] = getattr(metadata, published.templates)
 
+    @property
+    def products(self) -> float:
+        """Multiplications that a prompt takes in the linear layers, which are nearly all."""
+        tower = self._published
+        weights = tower.layers * (4 * tower.width**2 + 2 * tower.width * tower.hidden)
+        return float(weights * tower.context * len(self._templates))
+
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
         """Embed n prompts of any Unicode text: (n, d) float32, unit length."""
         rows = np.zeros((len(prompts), self._published.dimension), np.float32)
@@ -139,6 +150,8 @@ def read_text(
 
     Raises:
         EncoderError: A package is missing, or a file is damaged or another model's.
+
+    A warning is logged where the device is the CPU and the tower so large that whoever asks will wait for an answer.
     """
     tower = build_tower(published, encoder).to_empty(device="cpu")
     words = _read_tokenizer(tokenizer, encoder)
@@ -146,7 +159,14 @@ def read_text(
     prefix = TEXT_PREFIX if next(iter(tower.state_dict())).startswith(TEXT_PREFIX) else ""
     state = read_part(model, TEXT_PREFIX, encoder)
     fit(tower, {prefix + name: value for name, value in state.items()}, f"weights '{model}'")
-    return SiglipTextEncoder(tower.to(device, dtype), words, published, device, encoder)
+    text = SiglipTextEncoder(tower.to(device, dtype), words, published, device, encoder)
+    if torch.device(device).type == "cpu" and text.products > _SLOW_PRODUCTS:
+        _log.warning(
+            "encoder '%s': its text tower is large and runs on the CPU, where a prompt may take more than a minute the first"
+            " time; on a GPU ('encoder.device') it takes a moment",
+            encoder,
+        )
+    return text
 
 
 def build_tower(published: TextTower, encoder: str) -> Any:

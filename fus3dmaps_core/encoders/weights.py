@@ -22,6 +22,7 @@ import socket
 import tempfile
 import urllib.parse
 import urllib.request
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -41,6 +42,7 @@ _TIMEOUT_S = 20.0  # Of one read from the network, not of the whole download.
 _CONNECT_S = 5.0  # Until a host that does not answer counts as not reachable.
 _CHUNK_BYTES = 1 << 20
 _WRAPPERS = ("state_dict", "model_state_dict", "model")  # Under which training scripts store the weights.
+_OBJECT = re.compile(r"GLOBAL (\S+) was not")  # Of torch's refusal to unpickle one.
 _NAMED = 3  # Names of a list that a message has.
 
 
@@ -208,16 +210,13 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
             content: Any = load_file(path)
         else:
             # Options of a training script are often stored beside the weights; this class can only hold values.
-            with torch.serialization.safe_globals([argparse.Namespace]):
+            with torch.serialization.safe_globals([argparse.Namespace]), warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # About files that are refused below, or read all the same.
                 content = torch.load(path, map_location="cpu", weights_only=True)
     except ImportError as error:
         raise EncoderError(f"weights '{path}': '{error.name}' is not installed; use fus3dmaps_ros[models]") from None
-    except pickle.UnpicklingError as error:
-        raise EncoderError(
-            f"weights '{path}': not a weight file, or one with Python objects in it, which are not loaded: {_line(error)}"
-        ) from None
     except Exception as error:  # The readers raise whatever their formats come across.
-        raise EncoderError(f"weights '{path}': not a weight file, or cut short: {_line(error)}") from None
+        raise EncoderError(f"weights '{path}': {_reading_problem(error)}") from None
     for wrapper in _WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
@@ -231,6 +230,20 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
     if all(name.startswith(prefix) for name in state):
         state = {name.removeprefix(prefix): value for name, value in state.items()}
     return state
+
+
+def _reading_problem(error: Exception) -> str:
+    """Why a file is not read. Torch's own words advise an option under which it would run what the file holds."""
+    text = str(error)
+    if isinstance(error, pickle.UnpicklingError):
+        found = _OBJECT.search(text)
+        holds = (
+            f"the file holds Python objects ({found[1]})" if found else "not a weight file, or one with Python objects in it"
+        )
+        return f"{holds}, which are not loaded; save its tensors alone"
+    if "TorchScript" in text:
+        return "the file holds a TorchScript program, which is not loaded; save its tensors alone"
+    return f"not a weight file, or cut short: {_line(error)}"
 
 
 def fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], what: str) -> None:

@@ -11,6 +11,7 @@ from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.runtimes.compiled_network import CompiledNetwork
 from fus3dmaps_core.runtimes.exporting import NamedEncoder, ensure_exported, graph_encoders
 from fus3dmaps_core.runtimes.graph_files import graph_directory, own_precision
+from fus3dmaps_core.runtimes.image_memory import naming_image_size
 from fus3dmaps_core.runtimes.opening import open_network
 from fus3dmaps_core.runtimes.packages import import_onnxruntime, import_tensorrt
 from fus3dmaps_core.runtimes.tensorrt_network import check_cuda
@@ -33,7 +34,7 @@ def accelerate(trio: EncoderTrio, encoder: EncoderConfig, image: ImageConfig) ->
 
     Raises:
         EncoderError: The runtime or its packages are missing or not for this device, an encoder has no graph, or a graph
-            cannot be made. The trio then is as it was.
+            cannot be made, for want of memory if the images are too large. The trio then is as it was.
     """
     if encoder.runtime == "torch":
         return trio
@@ -43,7 +44,8 @@ def accelerate(trio: EncoderTrio, encoder: EncoderConfig, image: ImageConfig) ->
         import_tensorrt()
     if encoder.runtime == "onnxruntime":
         import_onnxruntime()
-    networks = [_network(named, encoder, image) for named in chosen]
+    with naming_image_size(trio.name, image.height, image.width):
+        networks = [_network(named, encoder, image) for named in chosen]
     for named, network in zip(chosen, networks, strict=True):
         named.encoder.run_with(network)
     return trio

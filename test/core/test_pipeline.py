@@ -160,6 +160,14 @@ def test_patches_that_the_dense_layer_does_not_need_are_embedded_for_instances()
     assert pipeline.trio.patch.images == 3
 
 
+def test_a_working_resolution_beyond_memory_is_refused_by_its_parameters():
+    pipeline = make()
+    pipeline.config = pipeline.config.with_values({"image.width": 1_000_000, "image.height": 1_000_000})
+    with pytest.raises(EncoderError, match=r"'image.width', 'image.height'.*1000000 x 1000000 pixels"):
+        pipeline.process(wall_frame(0))
+    assert pipeline.semantic_map.voxel_count == 0
+
+
 def test_lambda_is_the_encoders_unless_it_is_set_or_patches_describe_masks():
     trio = replace(color_trio(), variance_ratio=5.0)
 

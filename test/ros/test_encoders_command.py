@@ -94,6 +94,10 @@ def test_weights_are_looked_for_where_they_are_said_to_be(run, tmp_path, by):
     assert heads["put_at"] == str(tmp_path / "cache/fus3dmaps/clip-dinoiser-heads/last.pt")
 
 
+def test_no_weights_are_those_that_the_authors_published(run):
+    assert listed(run, "--set", "encoder.weights=") == listed(run)
+
+
 def test_the_table_says_what_is_missing_and_what_to_do(run):
     code, out, _ = run()
     assert code == 0
@@ -135,6 +139,8 @@ def test_a_broken_trio_is_a_row_of_its_own(run, monkeypatch):
     [
         (("--weights", "/no/such/place"), "no file or directory '/no/such/place'"),
         (("--set", "image.height=0"), "image.height"),
+        (("--set", "encoder.name=foo"), f"unknown encoder 'foo', known are {', '.join(registry.names())}"),
+        (("--json", "--set", "encoder.name="), "encoder.name': unknown encoder ''"),
         (("--set", "image.height"), "expected key=value"),
     ],
 )

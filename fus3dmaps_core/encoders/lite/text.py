@@ -30,7 +30,9 @@ class SentenceModel:
             from tokenizers import Tokenizer
             from transformers import BertConfig, BertModel
         except ImportError as error:
-            raise EncoderError(f"encoder 'lite' needs '{error.name}', which is not installed; use {EXTRA}") from None
+            raise EncoderError(
+                f"parameter 'encoder.name': encoder 'lite' needs '{error.name}', which is not installed; use {EXTRA}"
+            ) from None
         model = BertModel(BertConfig.from_json_file(TEXT_CONFIG.locate()))
         state = load_file(TEXT_MODEL.locate())
         state.pop("embeddings.position_ids", None)  # A constant that older versions of the library stored with the weights.

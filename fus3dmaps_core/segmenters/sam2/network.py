@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from fus3dmaps_core.encoders.optional_packages import import_optional
-from fus3dmaps_core.encoders.weights import find_weights, fit, read_state
+from fus3dmaps_core.encoders.weights import find_weights, fit, read_state, saying_what_to_get
 from fus3dmaps_core.segmenters.sam2.published import PARAMETER, SAM2
 
 SIDE = 1024
@@ -60,7 +60,8 @@ def load_sam2(weights: str, side: int = SIDE) -> Any:
     """
     network = build_sam2(side)
     path = find_weights(PARAMETER, weights, SAM2)
-    fit(network, image_weights(read_state(path)), f"weights '{path}'")
+    with saying_what_to_get(PARAMETER, SAM2):
+        fit(network, image_weights(read_state(path)), f"weights '{path}'")
     return network
 
 

@@ -390,6 +390,35 @@ def test_a_file_with_code_in_it_is_refused_and_does_not_run(tmp_path, write):
     assert not (tmp_path / "ran").exists()
 
 
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+def test_torchs_advice_to_run_what_a_file_holds_is_not_passed_on(tmp_path, protocol, recwarn):
+    path = tmp_path / "bad.pt"
+    path.write_bytes(pickle.dumps({"weight": torch.ones(1), "x": Harmful(tmp_path / "ran")}, protocol))
+    with pytest.raises(EncoderError, match=r"Python objects.*not loaded") as refusal:
+        read_state(path)
+    for torchs in ("weights_only", "can still be loaded", "trust"):
+        assert torchs not in str(refusal.value)
+    assert not recwarn.list
+
+
+def test_the_python_object_is_named(tmp_path):
+    torch.save({"x": argparse.FileType()}, tmp_path / "bad.pt")
+    with pytest.raises(
+        EncoderError, match=r"bad\.pt': the file holds Python objects \(argparse\.FileType\), which are not loaded"
+    ):
+        read_state(tmp_path / "bad.pt")
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch.jit")
+def test_a_torchscript_program_is_refused_without_torchs_advice(tmp_path, recwarn):
+    torch.jit.trace(nn.Linear(2, 2), torch.ones(1, 2)).save(str(tmp_path / "a.pt"))
+    recwarn.clear()
+    with pytest.raises(EncoderError, match=r"a\.pt': the file holds a TorchScript program, which is not loaded") as refusal:
+        read_state(tmp_path / "a.pt")
+    assert "weights_only" not in str(refusal.value)
+    assert not recwarn.list
+
+
 @pytest.mark.parametrize("name", ["a.pt", "a.safetensors"])
 @pytest.mark.parametrize("damage", [lambda data: data[: len(data) // 2], lambda _: b"", lambda _: b"<html>log in</html>"])
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, name, damage):

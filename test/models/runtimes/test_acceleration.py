@@ -183,6 +183,16 @@ def test_compiled_networks_say_the_same(toy, tmp_path, rgb):
     assert toy.patch.run is not toy.patch._network
 
 
+@pytest.mark.parametrize("runtime", ["onnxruntime", "compile"])
+def test_images_beyond_memory_are_refused_by_their_size(toy, tmp_path, runtime):
+    with pytest.raises(EncoderError, match=r"^parameters 'image\.width', 'image\.height': encoder 'toy' .* memory") as told:
+        accelerate(toy, config(tmp_path, runtime=runtime), ImageConfig(height=1_600_000, width=3_200_000))
+    assert "3200000 x 1600000" in str(told.value)
+    assert "compiler" not in str(told.value)
+    assert "\n" not in str(told.value)
+    assert toy.patch.run is toy.patch._network
+
+
 def test_without_a_compiler_one_line_says_so(toy, tmp_path, monkeypatch):
     from torch._inductor import config as inductor
 

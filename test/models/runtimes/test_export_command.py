@@ -30,9 +30,11 @@ def _the_toy_is_registered(monkeypatch):
     monkeypatch.setitem(sys.modules, "tensorrt", None)
 
 
-def export(folder: Path, precision: str = "fp32", name: str = "toy", as_json: bool = False) -> str:
+def export(
+    folder: Path, precision: str = "fp32", name: str = "toy", as_json: bool = False, size: tuple[int, int] = (32, 48)
+) -> str:
     stream = StringIO()
-    values = {"encoder.name": name, "encoder.precision": precision, "image.height": 32, "image.width": 48}
+    values = {"encoder.name": name, "encoder.precision": precision, "image.height": size[0], "image.width": size[1]}
     export_encoders(Config.from_flat(values), folder, Console(file=stream, width=60), as_json=as_json)
     return stream.getvalue()
 
@@ -96,3 +98,6 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
         export(tmp_path / "file" / "graphs")
     with pytest.raises(EncoderError, match="unknown encoder 'nobody'"):
         export(tmp_path, name="nobody")
+    with pytest.raises(EncoderError, match=r"'image\.width', 'image\.height': encoder 'toy' .* 3200000 x 1600000 pixels"):
+        export(tmp_path / "large", size=(1_600_000, 3_200_000))
+    assert not (tmp_path / "large").exists()

@@ -16,6 +16,7 @@ from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.registry import load_segmenter
 from fus3dmaps_core.segmenters.sam2.network import build_sam2, load_sam2
 from fus3dmaps_core.segmenters.sam2.points import PointSettings, masks_at_points, point_grid
+from fus3dmaps_core.segmenters.sam2.published import SAM2
 from fus3dmaps_core.segmenters.sam2.segmenter import STD, Sam2Segmenter
 
 SIDE = 256
@@ -80,6 +81,14 @@ def test_weights_of_another_network_are_refused(published, tmp_path, change, com
         load_sam2(str(path), SIDE)
     assert complaint in str(refusal.value)
     assert "\n" not in str(refusal.value)
+    assert "/facebook/sam2.1-hiera-tiny/resolve/" in str(refusal.value)
+
+
+def test_a_graph_in_place_of_weights_is_refused_by_parameter_with_what_to_get(tmp_path):
+    path = tmp_path / "sam2.onnx"
+    path.write_bytes(b"graph")
+    with pytest.raises(EncoderError, match=r"sam2\.onnx': an ONNX graph.*download https://.*set 'segmenter\.weights'"):
+        load_segmenter("sam2", EncoderConfig(), str(path))
 
 
 def test_without_weights_it_says_what_to_download_and_where_to_put_it(tmp_path):
@@ -87,7 +96,7 @@ def test_without_weights_it_says_what_to_download_and_where_to_put_it(tmp_path):
         load_segmenter("sam2", EncoderConfig(), str(tmp_path))
     message = str(refusal.value)
     assert message.startswith("parameter 'segmenter.weights': SAM 2.1 Hiera tiny: ")
-    assert "https://huggingface.co/facebook/sam2.1-hiera-tiny/resolve/main/model.safetensors" in message
+    assert f"https://huggingface.co/facebook/sam2.1-hiera-tiny/resolve/{SAM2.revision}/model.safetensors" in message
     assert "\n" not in message
 
 
