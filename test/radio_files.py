@@ -76,6 +76,25 @@ def write_checkpoint(path: Path, checkout: Path, name: str, hidden: int, inner: 
     return path
 
 
+def with_norms(path: Path) -> Path:
+    """Rewrite a checkpoint as one with a final norm and a feature normalizer, under the names that RADIO has for them.
+
+    Without them both are identities, and layer scales are all the same: what is left out or exchanged would not show.
+    """
+    content = torch.load(path, weights_only=False)
+    state, described = content["state_dict"], content["args"]
+    width = state["base_model.blocks.0.norm1.weight"].shape[0]
+    described.model_norm = True
+    state["base_model.norm.weight"], state["base_model.norm.bias"] = 1 + 0.3 * torch.randn(width), 0.3 * torch.randn(width)
+    state["_feature_normalizer.mean"] = 0.3 * torch.randn(width)
+    state["_feature_normalizer.tx"] = torch.linalg.qr(torch.randn(width, width))[0] * (0.5 + torch.rand(width, 1))
+    for name in state:
+        if name.endswith((".norm1.weight", ".norm2.weight", ".ls1.gamma", ".ls2.gamma")):
+            state[name] = 0.5 + torch.rand(width)
+    torch.save(content, path)
+    return path
+
+
 def any_content(file: WeightFile) -> WeightFile:
     """The file as far as its name and place go: random weights have no published hash."""
     return replace(file, sha256="", git_blob="")
@@ -93,8 +112,15 @@ def small_text_pair(name: str) -> RadioPair:
     return replace(pair, text=replace(pair.text, vocabulary=100, width=32, hidden=64, layers=2, heads=2))
 
 
-def write_text(folder: Path, pair: RadioPair) -> torch.nn.Module:
-    """Files of the pair's text tower with random weights, and of a tokenizer with a few words; returns the tower."""
+def write_text(folder: Path, pair: RadioPair, lengths_differ: bool = False) -> torch.nn.Module:
+    """Files of the pair's text tower with random weights, and of a tokenizer with a few words; returns the tower.
+
+    Args:
+        folder: Where to.
+        pair: Whose tower.
+        lengths_differ: Whether embeddings of sentences differ in length by factors. In a tower of random weights they do
+            not, and neither do their directions.
+    """
     from safetensors.torch import save_file
     from tokenizers import Tokenizer, models, pre_tokenizers
 
@@ -103,6 +129,8 @@ def write_text(folder: Path, pair: RadioPair) -> torch.nn.Module:
     tower = build_tower(pair.text, pair.name).to_empty(device="cpu")
     for weight in tower.parameters():
         torch.nn.init.normal_(weight, std=0.2)
+    if lengths_differ:
+        _spread(tower, pair)
     others = {"logit_scale": torch.zeros(1), "vision_model.post_layernorm.weight": torch.ones(4)}
     state = {f"text_model.{key.removeprefix('text_model.')}": value for key, value in tower.state_dict().items()}
     save_file(state | others, folder / "model.safetensors")
@@ -111,3 +139,18 @@ def write_text(folder: Path, pair: RadioPair) -> torch.nn.Module:
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
     tokenizer.save(str(folder / "tokenizer.json"))
     return tower
+
+
+def _spread(tower: torch.nn.Module, pair: RadioPair) -> None:
+    """Other weights: sentences have more influence, and the bias at the end takes away what all of them have in common."""
+    weights = dict(tower.named_parameters())
+    for name, weight in weights.items():
+        torch.nn.init.normal_(weight, mean=1.0 if name.endswith("norm.weight") else 0.0)
+    words, context = 3 + len(WORDS.split()), pair.text.context
+    rows = [
+        [*torch.randint(2, words, (count,)).tolist(), pair.text.end_id] + [pair.text.pad_id] * (context - count - 1)
+        for count in range(4, 20)
+    ]
+    with torch.no_grad():
+        embeddings = tower(input_ids=torch.tensor(rows), position_ids=torch.arange(context)[None]).pooler_output
+        next(weight for name, weight in weights.items() if name.endswith("head.bias")).sub_(embeddings.mean(dim=0))

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from pooled_patches import map_with_pooled_patches
 from reference.clip_vit import patch_features
 from safetensors.torch import save_file
 from stand_ins import ColorSegmenter, wall_frame
 
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
-from fus3dmaps_core.encoders.clip_dinoiser.guided_pooling import THRESHOLD
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
-from fus3dmaps_core.encoders.clip_dinoiser.network import MEAN, STD, ClipDinoiser, build_clip
+from fus3dmaps_core.encoders.clip_dinoiser.network import ClipDinoiser, build_clip
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.errors import EncoderError
@@ -24,6 +24,9 @@ from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.query import TextQuery, answer_query
 
 PATCH_PX, HEADS, LAYERS = 16, 12, 12
+# What the authors of CLIP and of CLIP-DINOiser published, not what the encoder says of it.
+MEAN, STD = np.array([0.48145466, 0.4578275, 0.40821073]), np.array([0.26862954, 0.26130258, 0.27577711])
+THRESHOLD = 0.2
 
 
 @pytest.fixture(scope="module")
@@ -97,7 +100,7 @@ def test_patch_crop_and_text_are_of_one_space(trio, rng):
     masks[0, 10:60, 20:50] = masks[1, 95, 127] = True
     crops = trio.crop.encode_crops(rgb, Masks.from_masks(masks))
     texts = trio.text.encode_text(["a chair", "", "чашка ☕", "\ud800 broken"])
-    assert (trio.name, trio.dimension, trio.variance_ratio) == ("clip_dinoiser", 512, 5.0)
+    assert (trio.name, trio.dimension, trio.variance_ratio, trio.logit_scale) == ("clip_dinoiser", 512, 5.0, 100.0)
     assert crops.shape == (2, 512)
     assert texts.shape == (4, 512)
     assert crops.dtype == texts.dtype == np.float32
@@ -122,13 +125,27 @@ def test_the_value_path_is_the_plain_ones(network, rng, size):
     np.testing.assert_allclose(found.intermediate[0].numpy(), intermediate, atol=1e-4 * np.abs(intermediate).max())
 
 
+def plain_heads(features: np.ndarray, weights: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Correlations (patches, patches) and saliency (rows, columns) of (width, rows, columns) features."""
+    _, rows, columns = features.shape
+    padded = np.pad(features, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    projected = weights["obj_proj.bias"][:, None, None] + sum(
+        np.einsum("ow,wrc->orc", weights["obj_proj.weight"][:, :, y, x], padded[:, y : y + rows, x : x + columns])
+        for y in range(3)
+        for x in range(3)
+    )
+    units = (projected / np.linalg.norm(projected, axis=0)).reshape(-1, rows * columns)
+    directions = features / np.linalg.norm(features, axis=0)
+    logits = np.einsum("w,wrc->rc", weights["bkg_decoder.weight"][0, :, 0, 0], directions) + weights["bkg_decoder.bias"]
+    return units.T @ units, 1 / (1 + np.exp(-logits))
+
+
 def test_embeddings_are_plain_features_pooled_in_loops(trio, network, heads, rng):
     rgb = picture(rng, 64, 96)
     weights = {name: value.double().numpy() for name, value in network.maskclip.visual.state_dict().items()}
     projected, intermediate = patch_features(normalised(rgb), weights, PATCH_PX, HEADS, LAYERS)
-    with torch.inference_mode():
-        correlations = heads.correlations(torch.from_numpy(intermediate).float()[None])[0].numpy()
-        saliency = heads.saliency(torch.from_numpy(intermediate).float()[None])[0].numpy()
+    in_heads = {name: value.double().numpy() for name, value in heads.state_dict().items()}
+    correlations, saliency = plain_heads(intermediate, in_heads)
     features = projected.reshape(512, -1).T
     patches = trio.patch.encode_patches(rgb)
     for patch, embedding in enumerate(patches.embeddings.reshape(-1, 512)):
@@ -191,6 +208,12 @@ def test_a_text_is_the_mean_of_clips_embeddings_of_its_templates(trio, clip):
     np.testing.assert_allclose(trio.text.encode_text(["x", "green armchair"])[1], expected, atol=1e-5)
 
 
+def test_a_long_text_is_cut_where_clip_cuts_it(trio):
+    tokens = trio.text._tokenizer(["cup " * 100, "cup"])
+    assert tokens.shape == (2, 77)
+    assert tokens[0, 76] == tokens[1, 2] == 49_407  # The end stays.
+
+
 def test_weights_of_a_directory_make_the_same_trio(trio, directory, rng):
     loaded = load_trio("clip_dinoiser", "cpu", 0.05, str(directory))
     rgb = picture(rng, 64, 96)
@@ -208,6 +231,10 @@ def test_weights_of_another_architecture_are_refused(directory, heads, tmp_path)
 def test_weights_that_are_not_there_are_named(tmp_path):
     with pytest.raises(EncoderError, match=r"encoder\.weights.*open_clip_model\.safetensors.*download https://huggingface"):
         load_trio("clip_dinoiser", "cpu", 0.05, str(tmp_path))
+
+
+def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
+    map_with_pooled_patches(trio, monkeypatch)
 
 
 def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from open_clip.zero_shot_metadata import SIMPLE_IMAGENET_TEMPLATES
+from pooled_patches import map_with_pooled_patches
 from reference.siglip_vit import pooled_alone, tokens
 from safetensors.torch import save_file
 from siglip2_files import published_state, random_model, write_directory, write_tokenizer
@@ -25,8 +26,6 @@ from fus3dmaps_core.encoders.graphs import GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.encoders.siglip2.network import (
-    MEAN,
-    STD,
     CropNetwork,
     PatchNetwork,
     SiglipTokens,
@@ -41,6 +40,7 @@ from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.query import TextQuery, answer_query
 
 PATCH_PX, HEADS, LAYERS = 16, 12, 12
+MEAN = STD = np.array([0.5, 0.5, 0.5])  # As published, not as the encoder says.
 SIZE_PX = 64  # 4x4 positions.
 SHORT_TEXT = replace(TEXT, vocabulary=100, layers=2)
 
@@ -124,7 +124,7 @@ def test_patch_crop_and_text_are_of_one_space(trio, rng):
     masks[0, 10:60, 20:50] = masks[1, 95, 127] = True
     crops = trio.crop.encode_crops(rgb, Masks.from_masks(masks))
     texts = trio.text.encode_text(["a chair", "", "чашка ☕", "\ud800 broken"])
-    assert (trio.name, trio.dimension, trio.variance_ratio) == ("siglip2", 768, 1.0)
+    assert (trio.name, trio.dimension, trio.variance_ratio, trio.logit_scale) == ("siglip2", 768, 1.0, 100.0)
     assert crops.shape == (2, 768)
     assert texts.shape == (4, 768)
     assert crops.dtype == texts.dtype == np.float32
@@ -325,6 +325,10 @@ def test_a_damaged_file_is_named(tmp_path, monkeypatch, name):
     (tmp_path / name).write_bytes(b"not weights" * 100)
     with pytest.raises(EncoderError, match=name):
         load_trio("siglip2", "cpu", 0.0, str(tmp_path / name))
+
+
+def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
+    map_with_pooled_patches(trio, monkeypatch)
 
 
 def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):

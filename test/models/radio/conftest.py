@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from radio_files import find_checkout, small_text_pair, write_checkpoint, write_text
+from radio_files import find_checkout, small_text_pair, with_norms, write_checkpoint, write_text
 
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.pair import load_trio
@@ -25,8 +25,10 @@ def loaded(request, checkout, tmp_path_factory) -> SimpleNamespace:
     folder = tmp_path_factory.mktemp(request.param)
     pair = small_text_pair(request.param)
     (folder / "RADIO").symlink_to(checkout, target_is_directory=True)
-    checkpoint = write_checkpoint(folder / pair.radio.file_name, checkout, pair.name, 48, 2, "vit_tiny_patch16_224", depth=3)
-    tower = write_text(folder, pair)
+    checkpoint = folder / pair.radio.file_name
+    network = {"depth": 3, "init_values": 1.0}  # With layer scales.
+    with_norms(write_checkpoint(checkpoint, checkout, pair.name, 48, 2, "vit_tiny_patch16_224", **network))
+    tower = write_text(folder, pair, lengths_differ=True)
     trio = load_trio(pair, "cpu", 0.0, str(folder))
     radio = read_checkpoint(checkpoint, folder / "RADIO", pair.name).radio
     return SimpleNamespace(folder=folder, pair=pair, trio=trio, radio=radio, tower=tower, checkpoint=checkpoint)

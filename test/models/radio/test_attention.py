@@ -18,8 +18,13 @@ SIDES, SEEDS = st.integers(1, 5), st.integers(0, 9)
 
 
 def attention(seed: int) -> Attention:
+    """With norms of queries and keys, which RADIO's published networks do without, and not those of a new network."""
     torch.manual_seed(seed)
-    return Attention(WIDTH, num_heads=HEADS, qkv_bias=True).double().eval().requires_grad_(False)
+    module = Attention(WIDTH, num_heads=HEADS, qkv_bias=True, qk_norm=True, norm_layer=torch.nn.LayerNorm).double()
+    for norm in (module.q_norm, module.k_norm):
+        torch.nn.init.normal_(norm.weight, mean=1.0, std=0.3)
+        torch.nn.init.normal_(norm.bias, std=0.3)
+    return module.eval().requires_grad_(False)
 
 
 def weights(module: Attention) -> dict[str, np.ndarray]:

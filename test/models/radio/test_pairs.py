@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pooled_patches import map_with_pooled_patches
+from reference.radio_attention import LAYER_EPSILON, gelu, last_block, layer_norm, neighbourhood, project, recursive
 from stand_ins import ColorSegmenter, wall_frame
 
 from fus3dmaps_core.config import Config
@@ -33,27 +35,39 @@ def unit(values: np.ndarray) -> np.ndarray:
     return values / np.linalg.norm(values, axis=-1, keepdims=True)
 
 
+def in_file(loaded, prefix: str) -> dict[str, np.ndarray]:
+    """Weights of the checkpoint whose names begin so, under the rest of their names."""
+    state = torch.load(loaded.checkpoint, weights_only=False)["state_dict"]
+    return {name.removeprefix(prefix): value.double().numpy() for name, value in state.items() if name.startswith(prefix)}
+
+
 def head(loaded, features: np.ndarray) -> np.ndarray:
     """The teacher's head by its weights in the file alone: unit embeddings of (..., width) features."""
-    state = torch.load(loaded.checkpoint, weights_only=False)["state_dict"]
-    weights = {
-        name.removeprefix(f"_heads.{TEACHER}."): value.double().numpy()
-        for name, value in state.items()
-        if name.startswith(f"_heads.{TEACHER}.")
-    }
+    weights = in_file(loaded, f"_heads.{TEACHER}.")
 
     def layer(values, name):
-        return values @ weights[f"{name}.weight"].T + weights[f"{name}.bias"]
+        return project(values, weights[f"{name}.weight"], weights[f"{name}.bias"])
 
     def normed_gelu(values, name):
-        values = (values - values.mean(-1, keepdims=True)) / np.sqrt(values.var(-1, keepdims=True) + 1e-5)
-        values = torch.from_numpy(values * weights[f"{name}.weight"] + weights[f"{name}.bias"])
-        return (values * 0.5 * (1 + torch.erf(values / 2**0.5))).numpy()
+        return gelu(layer_norm(values, weights, name, 1e-5))
 
     values = layer(features.astype(np.float64), "fc1")
     for block in range(2):
         values = values + layer(normed_gelu(values, f"blocks.{block}.0"), f"blocks.{block}.2")
     return unit(layer(normed_gelu(values, "final.0"), "final.2"))
+
+
+def into_the_last_block(loaded, rgb: np.ndarray) -> np.ndarray:
+    """Tokens (N, width) that RADIO's own pass over an image brings to its last block."""
+    seen: list[torch.Tensor] = []
+    hook = loaded.radio.model.blocks[-1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
+    try:
+        with torch.inference_mode():
+            loaded.radio(torch.from_numpy(rgb).permute(2, 0, 1)[None] / 255.0)
+    finally:
+        hook.remove()
+    (tokens,) = seen
+    return tokens[0].double().numpy()
 
 
 @pytest.mark.parametrize(("size", "grid"), [((480, 640), (30, 40)), ((336, 336), (21, 21)), ((100, 33), (7, 3))])
@@ -123,6 +137,24 @@ def test_without_another_attention_patches_are_radios_own(loaded, rng):
     assert np.abs(own - expected).max() > 1e-3
 
 
+def test_patches_are_plain_loops_over_the_last_block_with_the_pairs_attention(loaded, rng):
+    """From the tokens before it to the embeddings, with what the papers say of each pair's attention."""
+    rows, columns, heads = 4, 9, 3
+    rgb = picture(rng, 16 * rows, 16 * columns)
+    tokens = into_the_last_block(loaded, rgb)
+    prefix = len(tokens) - rows * columns
+    attentions = {
+        "naradio": lambda values, attention: neighbourhood(values, attention, heads, prefix, rows, columns, sigma=7.0),
+        "radseg": lambda values, attention: recursive(values, attention, heads, scale=10.0),
+    }
+    values = last_block(tokens, in_file(loaded, "base_model.blocks.2."), attentions[loaded.pair.name])
+    features = layer_norm(values, in_file(loaded, "base_model."), "norm", LAYER_EPSILON)[prefix:]
+    normalizer = in_file(loaded, "_feature_normalizer.")
+    expected = head(loaded, (features - normalizer["mean"]) @ normalizer["tx"].T).reshape(rows, columns, -1)
+    found = loaded.trio.patch.encode_patches(rgb).embeddings
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
 @pytest.mark.parametrize(("row", "column"), [(0, 0), (1, 6), (3, 2)])
 def test_a_changed_patch_changes_its_own_embedding_most(loaded, rng, row, column):
     rgb = picture(rng, 64, 128)
@@ -180,7 +212,19 @@ def test_a_pipeline_maps_and_answers(loaded):
         assert np.isfinite(answer.similarity).all()
 
 
-def test_lambda_is_the_papers():
-    assert NARADIO.variance_ratio == 1.0
-    assert NARADIO.dimension == 1152
-    assert RADSEG.dimension == 1152
+def test_instances_of_pooled_patches_need_no_crop(loaded, monkeypatch):
+    map_with_pooled_patches(loaded.trio, monkeypatch)
+
+
+def test_constants_are_the_published_ones():
+    assert (NARADIO.variance_ratio, RADSEG.variance_ratio) == (1.0, 1.0)
+    assert (NARADIO.dimension, RADSEG.dimension) == (1152, 1152)
+    assert (NARADIO.crop_px, RADSEG.crop_px) == (336, 336)
+    assert (NARADIO.teacher, RADSEG.teacher) == ("siglip", "siglip2")
+    assert (NARADIO.text.context, RADSEG.text.context) == (64, 64)
+    assert (NARADIO.text.end_id, NARADIO.text.pad_id) == (1, 1)
+    assert (RADSEG.text.end_id, RADSEG.text.pad_id) == (1, 0)
+
+
+def test_cosines_are_scaled_as_in_the_evaluations_of_these_models(loaded):
+    assert loaded.trio.logit_scale == 100.0

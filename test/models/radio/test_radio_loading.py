@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shutil
 from pathlib import Path
 from urllib.error import URLError
@@ -59,6 +60,7 @@ def test_the_code_is_fetched_at_the_pinned_revision(monkeypatch, tmp_path, check
     monkeypatch.setattr(torch.hub, "list", fetch)
     found = find_checkout("", "naradio")
     assert asked == [(f"NVlabs/RADIO:{REVISION}", True)]
+    assert re.fullmatch("[0-9a-f]{40}", REVISION)  # A commit: branches and tags move.
     assert (found / "hubconf.py").is_file()
     assert find_checkout("", "naradio") == found  # From the cache.
     assert len(asked) == 1

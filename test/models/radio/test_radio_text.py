@@ -8,24 +8,27 @@ import torch
 from open_clip.zero_shot_metadata import OPENAI_IMAGENET_TEMPLATES
 from tokenizers import Tokenizer
 
+from fus3dmaps_core.encoders import siglip_text
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
 from fus3dmaps_core.encoders.radio.pair import load_text_encoder
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
-from fus3dmaps_core.encoders.siglip_text import build_tower, canonical
+from fus3dmaps_core.encoders.siglip2.published import TEXT
+from fus3dmaps_core.encoders.siglip_text import SiglipTextEncoder, build_tower, canonical, read_text
 
 
 def test_a_prompt_is_the_unit_mean_of_its_unit_sentences(loaded):
     tokenizer = Tokenizer.from_file(str(loaded.folder / "tokenizer.json"))
-    units = []
+    rows = []
     for template in OPENAI_IMAGENET_TEMPLATES:
         sentence = template("red cup").lower().replace(".", "").replace("-", "")
         ids = [*tokenizer.encode(sentence).ids, 1]
         ids = torch.tensor([ids + [loaded.pair.text.pad_id] * (64 - len(ids))])
         with torch.inference_mode():
-            row = loaded.tower(input_ids=ids, position_ids=torch.arange(64)[None]).pooler_output[0].double().numpy()
-        units.append(row / np.linalg.norm(row))
-    mean = np.mean(units, axis=0)
-    assert len(units) == 80
+            rows.append(loaded.tower(input_ids=ids, position_ids=torch.arange(64)[None]).pooler_output[0].double().numpy())
+    lengths = np.linalg.norm(rows, axis=1)
+    assert len(rows) == 80
+    assert lengths.max() > 1.5 * lengths.min()  # Long ones would outweigh short ones.
+    mean = np.mean(rows / lengths[:, None], axis=0)
     expected = mean / np.linalg.norm(mean)
     np.testing.assert_allclose(loaded.trio.text.encode_text(["Red cup!"])[0], expected, atol=1e-5)
 
@@ -66,3 +69,25 @@ def test_the_published_towers_have_their_published_sizes(pair, vocabulary):
     rest = (vocabulary + 64 + 2) * width + (width + 1) * pair.dimension
     assert sum(parameter.numel() for parameter in tower.parameters()) == 27 * block + rest
     assert tower.config.hidden_act == "gelu_pytorch_tanh"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentences", "slow"), [(NARADIO.text, 80, True), (RADSEG.text, 80, True), (TEXT, 7, False)]
+)
+def test_towers_are_slow_by_the_products_of_a_prompt(text, sentences, slow):
+    layers = [part for name, part in build_tower(text, "some").named_modules() if ".layers." in name]
+    weights = sum(part.weight.numel() for part in layers if isinstance(part, torch.nn.Linear))
+    products = SiglipTextEncoder(None, None, text, "cpu", "some").products
+    assert products == weights * 64 * sentences
+    assert (products > siglip_text._SLOW_PRODUCTS) == slow
+
+
+@pytest.mark.parametrize(("device", "slow", "warned"), [("cpu", 1.0, True), ("cpu", 1e12, False), ("meta", 1.0, False)])
+def test_who_asks_a_large_tower_on_the_processor_is_told_to_wait(loaded, monkeypatch, caplog, device, slow, warned):
+    """A device without values stands for all that are not the processor."""
+    monkeypatch.setattr(siglip_text, "_SLOW_PRODUCTS", slow)
+    files = loaded.folder / "model.safetensors", loaded.folder / "tokenizer.json"
+    read_text(loaded.pair.text, *files, device, loaded.pair.name)
+    lines = [record.message for record in caplog.records if "on the CPU" in record.message]
+    assert len(lines) == warned
+    assert all(f"encoder '{loaded.pair.name}'" in line and "'encoder.device'" in line for line in lines)

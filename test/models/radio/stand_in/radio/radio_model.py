@@ -40,17 +40,27 @@ class Conditioner(nn.Module):
         return (images - self.norm_mean) / self.norm_std
 
 
-class RADIOModel(nn.Module):
-    def __init__(self, model):
+class FeatureNormalizer(nn.Module):
+    def __init__(self, width):
         super().__init__()
-        self.model, self.input_conditioner, self.feature_normalizer = model, Conditioner(), nn.Identity()
+        self.register_buffer("mean", torch.zeros(width))
+        self.register_buffer("tx", torch.eye(width))
+
+    def forward(self, features):
+        return (features - self.mean) @ self.tx.T
+
+
+class RADIOModel(nn.Module):
+    def __init__(self, model, feature_normalizer):
+        super().__init__()
+        self.model, self.input_conditioner, self.feature_normalizer = model, Conditioner(), feature_normalizer
         self.num_summary_tokens, self.patch_size = model.num_summary_tokens, model.patch_generator.patch_px
         self.summary_tokens = model.summary_tokens
 
     def forward(self, images):
         tokens = self.model.patch_generator(self.input_conditioner(images))
         tokens = self.model.norm(self.model.blocks(tokens))
-        return tokens[:, self.summary_tokens].flatten(1), tokens[:, self.num_summary_tokens :]
+        return tokens[:, self.summary_tokens].flatten(1), self.feature_normalizer(tokens[:, self.num_summary_tokens :])
 
 
 def create_model_from_args(args):
@@ -62,5 +72,7 @@ def create_model_from_args(args):
     vit.num_summary_tokens = prefix
     vit.summary_tokens = [place for place, teacher in enumerate(args.teachers) if teacher["use_summary"]]
     vit.patch_embed = vit.cls_token = vit.pos_embed = None
-    vit.norm = vit.head = nn.Identity()
+    vit.head = nn.Identity()
+    if not getattr(args, "model_norm", False):
+        vit.norm = nn.Identity()
     return vit

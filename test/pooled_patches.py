@@ -1,0 +1,46 @@
+"""A pipeline whose instances are described by the patches of their frame, with the encoders of a pair."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from stand_ins import ColorSegmenter, wall_frame
+
+from fus3dmaps_core.config import Config
+from fus3dmaps_core.encoders.protocols import EncoderTrio
+from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_core.query import TextQuery, answer_query
+
+
+def map_with_pooled_patches(trio: EncoderTrio, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Map three frames; no crop may be embedded, and what reaches the map is of unit length and of the trio's space."""
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a crop was embedded")
+
+    monkeypatch.setattr(trio.crop, "encode_crops", refuse)
+    settings = {
+        "encoder.instance_embeddings": "patches",
+        "image.width": 224,
+        "image.height": 160,
+        "segmenter.min_area_px": 30,
+    }
+    pipeline = Pipeline(Config.from_flat(settings), trio, ColorSegmenter())
+    integrate, given = pipeline.semantic_map.integrate_proposals, []
+
+    def watched(points_m, proposals, embeddings, visible_points_m=None):
+        given.append(embeddings)
+        return integrate(points_m, proposals, embeddings, visible_points_m)
+
+    monkeypatch.setattr(pipeline.semantic_map, "integrate_proposals", watched)
+    reports = [pipeline.process(wall_frame(i, x_m=0.2 * i - 0.2)) for i in range(3)]
+    assert all(report.dense and report.instances and report.proposals for report in reports)
+    embeddings = np.concatenate(given)
+    assert len(embeddings) == sum(report.proposals for report in reports)
+    assert embeddings.shape[1] == trio.dimension
+    np.testing.assert_allclose(np.linalg.norm(embeddings, axis=1), 1, atol=1e-5)
+    # A patch network averages nothing by itself: two objects of two colours have two embeddings.
+    assert np.abs(embeddings[0] - embeddings[1]).max() > 1e-4
+    answer = answer_query(pipeline.semantic_map, trio.text, TextQuery(["a red square"], layer="instances"), trio.logit_scale)
+    assert answer.instances
+    assert np.isfinite(answer.similarity).all()
