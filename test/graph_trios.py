@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from radio_files import find_checkout, small_text_pair, write_checkpoint, write_text
+from radio_files import find_checkout, small_text_pair, with_norms, write_checkpoint, write_text
 from siglip2_files import random_model, write_directory
 from torch import nn
 from torch.nn import functional
@@ -43,7 +43,7 @@ def narrow_radio(name: str, folder: Path) -> EncoderTrio:
     torch.manual_seed(11)
     checkout, pair = find_checkout(), replace(small_text_pair(name), crop_px=CROP_PX)
     (folder / "RADIO").symlink_to(checkout, target_is_directory=True)
-    write_checkpoint(folder / pair.radio.file_name, checkout, name, 48, 2, "vit_tiny_patch16_224", depth=3)
+    with_norms(write_checkpoint(folder / pair.radio.file_name, checkout, name, 48, 2, "vit_tiny_patch16_224", depth=3))
     write_text(folder, pair)
     return radio_pair.load_trio(pair, "cpu", 0.05, str(folder))
 
