@@ -10,13 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 from fus3dmaps_core.encoders.cards import EncoderCard
-from fus3dmaps_core.encoders.clip_dinoiser.crop import ClipCropEncoder
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
-from fus3dmaps_core.encoders.clip_dinoiser.network import ClipDinoiser, load_clip, load_heads
-from fus3dmaps_core.encoders.clip_dinoiser.patch import DinoiserPatchEncoder
+from fus3dmaps_core.encoders.clip_dinoiser.network import MEAN, STD, ClipCrops, ClipDinoiser, load_clip, load_heads
 from fus3dmaps_core.encoders.clip_dinoiser.published import CLIP, HEADS
 from fus3dmaps_core.encoders.clip_dinoiser.text import ClipTextEncoder
 from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 
 CARD = EncoderCard(
@@ -76,7 +75,9 @@ def make_trio(clip: Any, heads: DinoiserHeads, device: str, crop_padding: float)
         dimension=CARD.dimension,
         variance_ratio=CARD.variance_ratio,
         logit_scale=_LOGIT_SCALE,
-        patch=DinoiserPatchEncoder(network, device),
-        crop=ClipCropEncoder(clip.visual, crop_padding, device),
+        patch=NetworkPatchEncoder(network, network.maskclip.patch_px, MEAN, STD, device, outputs=("embeddings", "saliency")),
+        crop=NetworkCropEncoder(
+            ClipCrops(clip.visual).eval(), CARD.dimension, int(clip.visual.image_size[0]), MEAN, STD, crop_padding, device
+        ),
         text=ClipTextEncoder(clip, device),
     )

@@ -8,12 +8,12 @@ import torch
 
 from fus3dmaps_core.encoders.cards import CodeCheckout, EncoderCard
 from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.encoders.radio.adaptor import CropNetwork, PatchNetwork, SummaryHead, load_head
 from fus3dmaps_core.encoders.radio.backbone import DenseAttention, RadioBackbone
 from fus3dmaps_core.encoders.radio.checkout import ARCHIVE, cached_checkout, find_checkout, import_from, locate_checkout
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
-from fus3dmaps_core.encoders.radio.images import RadioCropEncoder, RadioPatchEncoder
 from fus3dmaps_core.encoders.radio.published import CODE_LICENCE
 from fus3dmaps_core.encoders.radio.text import load_text
 from fus3dmaps_core.encoders.siglip_text import TextTower
@@ -145,8 +145,8 @@ def make_trio(
         dimension=head.dimension,
         variance_ratio=pair.variance_ratio,
         logit_scale=_LOGIT_SCALE,
-        patch=RadioPatchEncoder(patches, device, dtype),
-        crop=RadioCropEncoder(crops, pair.crop_px, crop_padding, device, dtype),
+        patch=NetworkPatchEncoder(patches, backbone.patch_px, backbone.mean, backbone.std, device),
+        crop=NetworkCropEncoder(crops, head.dimension, pair.crop_px, backbone.mean, backbone.std, crop_padding, device),
         text=text,
     )
 

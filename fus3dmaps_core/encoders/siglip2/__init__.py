@@ -19,11 +19,19 @@ import torch
 
 from fus3dmaps_core.encoders.cards import EncoderCard
 from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
-from fus3dmaps_core.encoders.siglip2.crop import Siglip2CropEncoder
-from fus3dmaps_core.encoders.siglip2.network import PATCH_PX, WIDTH, CropNetwork, PatchNetwork, SiglipTokens, read_vision
-from fus3dmaps_core.encoders.siglip2.patch import Siglip2PatchEncoder
+from fus3dmaps_core.encoders.siglip2.network import (
+    MEAN,
+    PATCH_PX,
+    STD,
+    WIDTH,
+    CropNetwork,
+    PatchNetwork,
+    SiglipTokens,
+    read_vision,
+)
 from fus3dmaps_core.encoders.siglip2.published import MODEL, TEXT, TOKENIZER
 from fus3dmaps_core.encoders.siglip_text import read_text
 from fus3dmaps_core.encoders.weights import find_weights, only_directory, saying_what_to_get
@@ -93,8 +101,8 @@ def make_trio(
         dimension=CARD.dimension,
         variance_ratio=CARD.variance_ratio,
         logit_scale=_LOGIT_SCALE,
-        patch=Siglip2PatchEncoder(PatchNetwork(tokens).eval(), device),
-        crop=Siglip2CropEncoder(CropNetwork(tokens).eval(), crop_padding, device),
+        patch=NetworkPatchEncoder(PatchNetwork(tokens).eval(), PATCH_PX, MEAN, STD, device),
+        crop=NetworkCropEncoder(CropNetwork(tokens).eval(), WIDTH, tokens.size_px, MEAN, STD, crop_padding, device),
         text=text,
     )
 
