@@ -11,7 +11,7 @@ from pathlib import Path
 from fus3dmaps_core.encoders import registry
 from fus3dmaps_core.encoders.cards import CodeCheckout, EncoderCard, ShippedFile
 from fus3dmaps_core.encoders.weights import WeightFile, is_hub_name, local_path, locate, only_directory
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 
 _TORCH_PIN = re.compile(r"torch\s*\(?\s*==\s*([^\s;,)]+)")
 
@@ -103,7 +103,7 @@ def catalogue(weights: str = "", encoder: str = "") -> list[Entry]:
         try:
             card = registry.card(name)
         except Exception as error:  # One trio that is broken, in whatever way, hides none of the others.
-            first = (str(error).splitlines() or [""])[0]
+            first = first_line(error)
             entries.append(Entry(name, None, error=f"cannot be imported: {type(error).__name__}: {first}"))
         else:
             entries.append(_entry(name, card, weights if name == encoder else only_directory(weights)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 
 
 def check_device(device: str) -> None:
@@ -17,5 +17,5 @@ def check_device(device: str) -> None:
         torch.empty(0, device=device).cpu()  # And back: "meta" holds no values.
     except (RuntimeError, AssertionError, ImportError) as error:  # Torch asserts where it was built without CUDA.
         # Torch may explain itself over half a hundred lines, the first sentence of which says it.
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0].partition(". ")[0]
+        reason = first_line(error).partition(". ")[0]
         raise EncoderError(f"parameter 'encoder.device': torch cannot use {device!r}: {reason}") from None

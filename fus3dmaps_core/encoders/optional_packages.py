@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from types import ModuleType
 
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 
 EXTRA = "fus3dmaps_ros[models]"
 
@@ -28,5 +28,5 @@ def import_optional(module: str, name: str, kind: str = "encoder") -> ModuleType
     except ImportError as error:
         raise EncoderError(f"{needs} needs '{error.name or module}', which is not installed; use {EXTRA}") from None
     except (RuntimeError, OSError, AttributeError) as error:  # So torchvision fails beside another torch than its own.
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise EncoderError(f"{needs}: cannot import '{module}' ({reason}); install {EXTRA}") from None

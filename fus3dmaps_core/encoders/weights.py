@@ -32,7 +32,7 @@ from typing import Any
 import torch
 
 from fus3dmaps_core.encoders.weight_content import TORCH_SUFFIXES, content_problem, hash_problem
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 
 _log = logging.getLogger(__name__)
 
@@ -143,7 +143,7 @@ def find_weights(parameter: str, value: str, file: WeightFile) -> Path:
         is_known = is_published and (file.sha256 or file.git_blob)
         problem = hash_problem(path, file.sha256, file.git_blob) if is_known else content_problem(path)
     except OSError as error:
-        raise EncoderError(f"{refusal}: cannot be read: {_line(error)}; {_advice(parameter, file)}") from None
+        raise EncoderError(f"{refusal}: cannot be read: {first_line(error)}; {_advice(parameter, file)}") from None
     if problem:
         raise EncoderError(f"{refusal}: '{path}' {problem}; {_advice(parameter, file)}")
     return path
@@ -216,7 +216,7 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
     except ImportError as error:
         raise EncoderError(f"weights '{path}': '{error.name}' is not installed; use fus3dmaps_ros[models]") from None
     except Exception as error:  # The readers raise whatever their formats come across.
-        raise EncoderError(f"weights '{path}': {_reading_problem(error)}") from None
+        raise EncoderError(f"weights '{path}': {reading_problem(error)}") from None
     for wrapper in _WRAPPERS:
         if isinstance(content, Mapping) and isinstance(content.get(wrapper), Mapping):
             content = content[wrapper]
@@ -232,7 +232,7 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
     return state
 
 
-def _reading_problem(error: Exception) -> str:
+def reading_problem(error: Exception) -> str:
     """Why a file is not read. Torch's own words advise an option under which it would run what the file holds."""
     text = str(error)
     if isinstance(error, pickle.UnpicklingError):
@@ -243,7 +243,7 @@ def _reading_problem(error: Exception) -> str:
         return f"{holds}, which are not loaded; save its tensors alone"
     if "TorchScript" in text:
         return "the file holds a TorchScript program, which is not loaded; save its tensors alone"
-    return f"not a weight file, or cut short: {_line(error)}"
+    return f"not a weight file, or cut short: {first_line(error)}"
 
 
 def fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], what: str) -> None:
@@ -341,13 +341,13 @@ def _download(refusal: str, repository: str, revision: str, parameter: str, file
             causes.append("the package 'huggingface_hub' is not installed")
         except Exception as error:  # The client passes on what its HTTP library raises.
             neither = "" if by_url else " is no directory here, and as a repository of the hub"
-            causes.append(f"'{repository}'{neither}: {_line(error)}")
+            causes.append(f"'{repository}'{neither}: {first_line(error)}")
     if by_url and file.url:
         try:
             _log.info("downloading %s", file.url)
             return _fetch(file.url, file.cached_path)
         except (OSError, ValueError, http.client.HTTPException) as error:
-            causes.append(_line(error))
+            causes.append(first_line(error))
     raise EncoderError(
         f"{refusal} is not on this machine and cannot be downloaded ({'; '.join(causes)}); {_advice(parameter, file)}"
     )
@@ -388,9 +388,3 @@ def _fetch(url: str, path: Path) -> Path:
 
 def _some(names: list[str]) -> str:
     return ", ".join(names[:_NAMED]) + (", ..." if len(names) > _NAMED else "")
-
-
-def _line(error: Exception) -> str:
-    """First line of what an exception says, and its class where it says nothing."""
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

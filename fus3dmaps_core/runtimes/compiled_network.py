@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from fus3dmaps_core.encoders.graphs import Graph
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.static_batches import listed, run_in_batches
 
 
@@ -36,9 +36,10 @@ class CompiledNetwork:
             with torch.inference_mode():  # As encoders run it; the two modes are compiled apart.
                 self._run(torch.zeros(graph.shape, device=device))
         except RuntimeError as error:  # The base of all that the compiler raises.
+            reason = first_line(error).rstrip(":;. ")
             raise EncoderError(
                 f"parameter 'encoder.runtime': torch cannot compile the graph '{graph.name}' of encoder '{trio}' on "
-                f"'{device}': {_line(error)}; it needs a C++ compiler (apt install g++), on CUDA triton; or set it to torch"
+                f"'{device}': {reason}; it needs a C++ compiler (apt install g++), on CUDA triton; or set it to torch"
             ) from None
 
     def __call__(self, images: torch.Tensor) -> torch.Tensor | tuple[torch.Tensor, ...]:
@@ -47,7 +48,3 @@ class CompiledNetwork:
 
     def _run(self, images: torch.Tensor) -> list[torch.Tensor]:
         return listed(self._compiled(images))
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(":;. ")

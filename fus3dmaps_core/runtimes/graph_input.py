@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.packages import import_onnx
 
 
@@ -18,7 +18,7 @@ def input_shape(path: Path) -> tuple[int, int, int, int]:
     try:
         graph = onnx.load(path, load_external_data=False).graph
     except Exception as error:  # Of its own and of the package protobuf, which have nothing in common.
-        reason = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        reason = first_line(error)
         raise EncoderError(f"graph '{path}': it cannot be read: {reason}") from None
     weights = {weight.name for weight in graph.initializer}
     inputs = [value for value in graph.input if value.name not in weights]

@@ -16,7 +16,7 @@ from torch import nn
 from fus3dmaps_core import __version__
 from fus3dmaps_core.config import Precision
 from fus3dmaps_core.encoders.graphs import Graph
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.files import external_data
 from fus3dmaps_core.runtimes.half_precision import round_products
 
@@ -109,4 +109,4 @@ def _reason(error: BaseException) -> str:
     """The first line of what an error goes back to: those around it explain the exporter's steps over many lines."""
     while error.__cause__ is not None:
         error = error.__cause__
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]
+    return first_line(error)

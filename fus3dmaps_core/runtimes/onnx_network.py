@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.packages import import_onnxruntime
 from fus3dmaps_core.runtimes.static_batches import run_in_batches
 
@@ -104,7 +104,7 @@ def _open(runtime: ModuleType, path: Path, device: torch.device) -> Any:
     try:
         session = runtime.InferenceSession(path, options, providers=providers)
     except Exception as error:  # Its exceptions have no common base but this.
-        raise EncoderError(f"graph '{path}': onnxruntime cannot load it: {_line(error)}") from None
+        raise EncoderError(f"graph '{path}': onnxruntime cannot load it: {first_line(error)}") from None
     if device.type == "cuda" and _CUDA not in session.get_providers():  # It falls back without a word.
         raise EncoderError(
             "parameter 'encoder.runtime': onnxruntime cannot use its CUDA libraries; install those of its CUDA version"
@@ -128,7 +128,3 @@ def _output_shapes(path: Path, outputs: Sequence[Any]) -> list[tuple[int, ...]]:
         if not all(isinstance(side, int) for side in value.shape):
             raise EncoderError(f"graph '{path}': output '{value.name}' must have a fixed shape on CUDA")
     return [tuple(value.shape) for value in outputs]
-
-
-def _line(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -17,7 +17,7 @@ import torch
 from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.radio.published import REPOSITORY, REVISION
 from fus3dmaps_core.encoders.weights import check_reachable, local_path
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.errors import EncoderError, first_line
 
 ARCHIVE = f"https://github.com/{REPOSITORY}/archive/{REVISION}.zip"
 """The pinned revision, to be unpacked."""
@@ -62,7 +62,7 @@ def find_checkout(weights: str, encoder: str) -> Path:
         hub: Any = torch.hub  # Without type hints.
         hub.list(f"{REPOSITORY}:{REVISION}", skip_validation=True, trust_repo=True, verbose=False)
     except Exception as error:  # Whatever the network, the archive or the code that it holds come across.
-        first = (str(error).splitlines() or [type(error).__name__])[0]
+        first = first_line(error)
         raise EncoderError(
             f"encoder '{encoder}': RADIO's code is not on this machine and cannot be downloaded ({first}); unpack "
             f"{ARCHIVE} so that its hubconf.py lies in '{cached}', or in the folder '{_FOLDER}' of a directory that "
