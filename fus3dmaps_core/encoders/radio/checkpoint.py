@@ -16,7 +16,8 @@ from typing import Any
 import torch
 
 from fus3dmaps_core.encoders.radio.checkout import import_from
-from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.encoders.weights import reading_problem
+from fus3dmaps_core.errors import EncoderError, first_line
 
 # torch.load heeds it whatever its caller asked for, and RADIO's loader asks for anything that a file may hold.
 _WEIGHTS_ONLY = "TORCH_FORCE_WEIGHTS_ONLY_LOAD"
@@ -60,13 +61,11 @@ def read_checkpoint(path: Path, checkout: Path, encoder: str) -> Checkpoint:
                 str(checkout), "radio_model", source="local", version=str(path), return_checkpoint=True, progress=False
             )
     except pickle.UnpicklingError as error:
-        raise EncoderError(
-            f"weights '{path}': not a weight file, or one with Python objects in it, which are not loaded: {_line(error)}"
-        ) from None
+        raise EncoderError(f"weights '{path}': {reading_problem(error)}") from None
     except (KeyError, AttributeError) as error:
-        raise EncoderError(f"weights '{path}': not a checkpoint of RADIO, it has no {_line(error)}") from None
+        raise EncoderError(f"weights '{path}': not a checkpoint of RADIO, it has no {first_line(error)}") from None
     except Exception as error:  # The reader and the network's builder raise whatever they come across.
-        raise EncoderError(f"weights '{path}': cannot be read as a checkpoint of RADIO: {_line(error)}") from None
+        raise EncoderError(f"weights '{path}': cannot be read as a checkpoint of RADIO: {first_line(error)}") from None
     state = content["state_dict_ema"] if "state_dict_ema" in content else content["state_dict"]
     missing = [name for name in radio.model.state_dict() if not _has(state, f"base_model.{name}")]
     if missing:
@@ -95,8 +94,3 @@ def _only_weights() -> Iterator[None]:
                 del os.environ[_WEIGHTS_ONLY]
             else:
                 os.environ[_WEIGHTS_ONLY] = before
-
-
-def _line(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else type(error).__name__

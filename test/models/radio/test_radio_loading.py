@@ -100,10 +100,12 @@ def test_another_package_of_the_same_name_is_not_mistaken_for_it(checkout, tmp_p
 def test_objects_in_a_file_are_refused_and_not_run(loaded, content, checkout, tmp_path):
     path, witness = tmp_path / "harmful.pth.tar", tmp_path / "witness"
     torch.save(content | {"extra": Harmful(witness)}, path)
-    with pytest.raises(EncoderError, match=r"harmful\.pth\.tar.*Python objects"):
+    with pytest.raises(EncoderError, match=r"harmful\.pth\.tar.*Python objects") as refusal:
         read_checkpoint(path, checkout, loaded.pair.name)
     assert not witness.exists()
     assert "TORCH_FORCE_WEIGHTS_ONLY_LOAD" not in os.environ
+    for advice in ("weights_only", "can still be loaded", "trust"):  # Torch's own, under which the command would run.
+        assert advice not in str(refusal.value)
 
 
 def test_a_damaged_file_is_refused(loaded, checkout, tmp_path):
