@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pooled_patches import map_with_pooled_patches
+from pair_maps import map_by_name, map_with_pooled_patches
 from reference.clip_vit import patch_features
 from safetensors.torch import save_file
-from stand_ins import ColorSegmenter, wall_frame
 
-from fus3dmaps_core.config import Config
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.clip_dinoiser.network import ClipDinoiser, build_clip
@@ -20,8 +18,6 @@ from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.masks import Masks
-from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
 
 PATCH_PX, HEADS, LAYERS = 16, 12, 12
 # What the authors of CLIP and of CLIP-DINOiser published, not what the encoder says of it.
@@ -238,23 +234,4 @@ def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
 
 
 def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
-    monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda *options: ColorSegmenter())
-    config = Config.from_flat(
-        {
-            "encoder.name": "clip_dinoiser",
-            "encoder.weights": str(directory),
-            "image.width": 224,
-            "image.height": 160,
-            "fusion.window_radius_m": 6.0,
-            "segmenter.min_area_px": 30,
-        }
-    )
-    pipeline = Pipeline.from_config(config)
-    reports = [pipeline.process(wall_frame(i, x_m=0.15 * i)) for i in range(3)]
-    assert all(report.dense and report.instances and report.proposals for report in reports)
-    assert pipeline.semantic_map.dimension == 512
-    for layer in ("dense", "fused_dense", "instances", "fused_instances"):
-        request = TextQuery(["a red square"], layer=layer)
-        answer = answer_query(pipeline.semantic_map, pipeline.trio.text, request, pipeline.trio.logit_scale)
-        assert len(answer.points_m)
-        assert np.isfinite(answer.similarity).all()
+    map_by_name("clip_dinoiser", directory, 512, monkeypatch)

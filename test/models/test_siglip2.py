@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 import torch
 from open_clip.zero_shot_metadata import SIMPLE_IMAGENET_TEMPLATES
-from pooled_patches import map_with_pooled_patches
+from pair_maps import map_by_name, map_with_pooled_patches
 from reference.siglip_vit import pooled_alone, tokens
 from safetensors.torch import save_file
 from siglip2_files import published_state, random_model, write_directory, write_tokenizer
-from stand_ins import ColorSegmenter, wall_frame
 from tokenizers import Tokenizer
 
-from fus3dmaps_core.config import Config
 from fus3dmaps_core.encoders import siglip2
 from fus3dmaps_core.encoders.graphs import GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
@@ -36,8 +34,6 @@ from fus3dmaps_core.encoders.siglip2.published import MODEL, TEXT, TOKENIZER
 from fus3dmaps_core.encoders.siglip_text import build_tower
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.masks import Masks
-from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
 
 PATCH_PX, HEADS, LAYERS = 16, 12, 12
 MEAN = STD = np.array([0.5, 0.5, 0.5])  # As published, not as the encoder says.
@@ -332,23 +328,4 @@ def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
 
 
 def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
-    monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda *options: ColorSegmenter())
-    config = Config.from_flat(
-        {
-            "encoder.name": "siglip2",
-            "encoder.weights": str(directory),
-            "image.width": 224,
-            "image.height": 160,
-            "fusion.window_radius_m": 6.0,
-            "segmenter.min_area_px": 30,
-        }
-    )
-    pipeline = Pipeline.from_config(config)
-    reports = [pipeline.process(wall_frame(i, x_m=0.15 * i)) for i in range(3)]
-    assert all(report.dense and report.instances and report.proposals for report in reports)
-    assert pipeline.semantic_map.dimension == 768
-    for layer in ("dense", "fused_dense", "instances", "fused_instances"):
-        request = TextQuery(["a red square"], layer=layer)
-        answer = answer_query(pipeline.semantic_map, pipeline.trio.text, request, pipeline.trio.logit_scale)
-        assert len(answer.points_m)
-        assert np.isfinite(answer.similarity).all()
+    map_by_name("siglip2", directory, 768, monkeypatch)

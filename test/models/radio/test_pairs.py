@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from pooled_patches import map_with_pooled_patches
+from pair_maps import map_with_pooled_patches
 from reference.radio_attention import LAYER_EPSILON, gelu, last_block, layer_norm, neighbourhood, project, recursive
 from stand_ins import ColorSegmenter, wall_frame
 

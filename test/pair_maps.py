@@ -1,6 +1,8 @@
-"""A pipeline whose instances are described by the patches of their frame, with the encoders of a pair."""
+"""Maps of a wall with painted squares by the encoders of a pair: chosen by its name, or with pooled patches."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,7 +11,24 @@ from stand_ins import ColorSegmenter, wall_frame
 from fus3dmaps_core.config import Config
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
+from fus3dmaps_core.query import LAYERS, TextQuery, answer_query
+
+SETTINGS = {"image.width": 224, "image.height": 160, "segmenter.min_area_px": 30}
+
+
+def map_by_name(name: str, weights: Path, dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Map three frames with the pair of a name and the weights in a directory; every layer answers."""
+    monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda *options: ColorSegmenter())
+    chosen = {"encoder.name": name, "encoder.weights": str(weights), "fusion.window_radius_m": 6.0}
+    pipeline = Pipeline.from_config(Config.from_flat({**SETTINGS, **chosen}))
+    reports = [pipeline.process(wall_frame(i, x_m=0.15 * i)) for i in range(3)]
+    assert all(report.dense and report.instances and report.proposals for report in reports)
+    assert pipeline.semantic_map.dimension == dimension
+    for layer in LAYERS:
+        request = TextQuery(["a red square"], layer=layer)
+        answer = answer_query(pipeline.semantic_map, pipeline.trio.text, request, pipeline.trio.logit_scale)
+        assert len(answer.points_m)
+        assert np.isfinite(answer.similarity).all()
 
 
 def map_with_pooled_patches(trio: EncoderTrio, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -19,12 +38,7 @@ def map_with_pooled_patches(trio: EncoderTrio, monkeypatch: pytest.MonkeyPatch) 
         raise AssertionError("a crop was embedded")
 
     monkeypatch.setattr(trio.crop, "encode_crops", refuse)
-    settings = {
-        "encoder.instance_embeddings": "patches",
-        "image.width": 224,
-        "image.height": 160,
-        "segmenter.min_area_px": 30,
-    }
+    settings = {**SETTINGS, "encoder.instance_embeddings": "patches"}
     pipeline = Pipeline(Config.from_flat(settings), trio, ColorSegmenter())
     integrate, given = pipeline.semantic_map.integrate_proposals, []
 
