@@ -42,8 +42,12 @@ setup(
     maintainer="fus3dmaps maintainers",
     maintainer_email="maintainers@fus3dmaps.example",
     python_requires=">=3.11",
-    packages=find_packages(include=["fus3dmaps_core*", "fus3dmaps_ros*"]),
-    package_data={"fus3dmaps_core": ["py.typed"], "fus3dmaps_ros": ["py.typed", "*.xml"]},
+    packages=find_packages(include=["fus3dmaps_core*", "fus3dmaps_lab*", "fus3dmaps_ros*"]),
+    package_data={
+        "fus3dmaps_core": ["py.typed"],
+        "fus3dmaps_lab": ["py.typed"],
+        "fus3dmaps_ros": ["py.typed", "topics/*.xml"],
+    },
     data_files=data_files(),
     zip_safe=False,
     # Lower bounds are Ubuntu 24.04's where apt brings the package on a robot; constraints.txt has the tested releases.
@@ -116,7 +120,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "fus3dmaps = fus3dmaps_ros.cli:main",
+            "fus3dmaps = fus3dmaps_ros.commands.cli:main",
             "mapper = fus3dmaps_ros.mapper_node:main",
             "player = fus3dmaps_ros.player_node:main",
         ],

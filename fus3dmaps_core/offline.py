@@ -10,9 +10,9 @@ from pathlib import Path
 
 from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_core.saved_maps.storage import MapInfo
 from fus3dmaps_core.sources.bag import BagSource
 from fus3dmaps_core.sources.pairing import PairedMessages
-from fus3dmaps_core.storage import MapInfo
 
 
 @dataclass

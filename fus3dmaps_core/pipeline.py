@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.encoders.batching import Batches, naming_out_of_memory
 from fus3dmaps_core.encoders.mask_pooling import pool_masks
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
@@ -20,14 +20,14 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.geometry.motion import KeyframeGate
 from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sample_pixels, unproject
 from fus3dmaps_core.masks import Masks
-from fus3dmaps_core.memory_budget import KeyframeBound, MemoryBudget
 from fus3dmaps_core.runtimes.acceleration import accelerate
 from fus3dmaps_core.runtimes.image_memory import naming_image_size
 from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
-from fus3dmaps_core.semantic_map import SemanticMap
-from fus3dmaps_core.warm_up import warm_up
+from fus3dmaps_core.voxel_map.budget import KeyframeBound, MemoryBudget
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.warm_up import warm_up
 
 
 @dataclass

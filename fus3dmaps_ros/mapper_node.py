@@ -17,29 +17,29 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.sources.streams import uses_tf
 from fus3dmaps_msgs.msg import MapperStatus
-from fus3dmaps_ros.autosave import Autosave
-from fus3dmaps_ros.drops import DropLog
-from fus3dmaps_ros.executor import CallbackExecutor
-from fus3dmaps_ros.inputs import Inputs
-from fus3dmaps_ros.lifecycle import UNCONFIGURED, ManagedNode
-from fus3dmaps_ros.map_services import MapServices
-from fus3dmaps_ros.map_store import read_newest
-from fus3dmaps_ros.outputs import Outputs
-from fus3dmaps_ros.parameters import declare_parameters, follow_changes, unknown_overrides
-from fus3dmaps_ros.query_services import QueryServices
-from fus3dmaps_ros.refusals import REFUSALS, one_line
-from fus3dmaps_ros.session import Session, SessionHolder
-from fus3dmaps_ros.signals import StopSignals
-from fus3dmaps_ros.status import StatusPublisher, status_line, status_message
-from fus3dmaps_ros.tf_poses import import_tf2_ros
-from fus3dmaps_ros.timed_calls import Deadline
-from fus3dmaps_ros.watch import Watch
-from fus3dmaps_ros.worker import FrameWorker
+from fus3dmaps_ros.node.autosave import Autosave
+from fus3dmaps_ros.node.drops import DropLog
+from fus3dmaps_ros.node.executor import CallbackExecutor
+from fus3dmaps_ros.node.lifecycle import UNCONFIGURED, ManagedNode
+from fus3dmaps_ros.node.map_store import read_newest
+from fus3dmaps_ros.node.parameters import declare_parameters, follow_changes, unknown_overrides
+from fus3dmaps_ros.node.refusals import REFUSALS, one_line
+from fus3dmaps_ros.node.session import Session, SessionHolder
+from fus3dmaps_ros.node.signals import StopSignals
+from fus3dmaps_ros.node.timed_calls import Deadline
+from fus3dmaps_ros.node.worker import FrameWorker
+from fus3dmaps_ros.reporting.status import StatusPublisher, status_line, status_message
+from fus3dmaps_ros.reporting.watch import Watch
+from fus3dmaps_ros.services.map_services import MapServices
+from fus3dmaps_ros.services.query_services import QueryServices
+from fus3dmaps_ros.topics.inputs import Inputs
+from fus3dmaps_ros.topics.outputs import Outputs
+from fus3dmaps_ros.topics.tf_poses import import_tf2_ros
 
 NODE_NAME = "fus3dmaps"
 _STOP_TIMEOUT_S = 1.0

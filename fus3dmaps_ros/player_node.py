@@ -25,8 +25,8 @@ from rosgraph_msgs.msg import Clock
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.storage import RawMessage
-from fus3dmaps_ros.refusals import REFUSALS
-from fus3dmaps_ros.transport import enlarge_shared_memory
+from fus3dmaps_ros.node.refusals import REFUSALS
+from fus3dmaps_ros.topics.transport import enlarge_shared_memory
 
 NODE_NAME = "fus3dmaps_player"
 _CLOCK_PERIOD_S = 0.01

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from stand_ins import ColorSegmenter, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.answers.query import LAYERS, TextQuery, answer_query
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import LAYERS, TextQuery, answer_query
 
 SETTINGS = {"image.width": 224, "image.height": 160, "segmenter.min_area_px": 30}
 

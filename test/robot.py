@@ -23,10 +23,10 @@ from std_msgs.msg import Header
 
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_ros.executor import CallbackExecutor
-from fus3dmaps_ros.inputs import input_qos
 from fus3dmaps_ros.mapper_node import MapperNode
-from fus3dmaps_ros.outputs import LATCHED
+from fus3dmaps_ros.node.executor import CallbackExecutor
+from fus3dmaps_ros.topics.inputs import input_qos
+from fus3dmaps_ros.topics.outputs import LATCHED
 
 TIMEOUT_S = 60.0
 RELIABLE_INPUTS = {f"input.{stream}_qos": "reliable" for stream in ("rgb", "depth", "camera_info", "pose")}

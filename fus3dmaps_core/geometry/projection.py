@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 
 

@@ -15,10 +15,10 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from fus3dmaps_core import __version__
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError, RecordingError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_core.input_config import InputConfig
-from fus3dmaps_core.messages import transform_from
+from fus3dmaps_core.messages.fields import transform_from
 
 CAMERA_FRAME = "camera_optical_frame"
 

@@ -5,7 +5,7 @@ Images alone are concerned. The text tower stays in torch: a prompt comes once i
 
 from __future__ import annotations
 
-from fus3dmaps_core.config import EncoderConfig, ImageConfig
+from fus3dmaps_core.config.schema import EncoderConfig, ImageConfig
 from fus3dmaps_core.encoders.graphs import Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.runtimes.compiled_network import CompiledNetwork

@@ -11,7 +11,7 @@ from typing import cast
 
 import torch
 
-from fus3dmaps_core.config import Precision
+from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.errors import EncoderError

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch.nn import functional
 
-from fus3dmaps_core.config import Precision
+from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.files import graph_hash, slug
 from fus3dmaps_core.runtimes.graph_files import checksum_path, is_whole, write_checksum

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fus3dmaps_core.config import Precision
+from fus3dmaps_core.config.schema import Precision
 
 _PRODUCTS = {
     "fp16": ("MatMul", "Gemm", "Conv", "ConvTranspose"),

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from fus3dmaps_core import __version__
-from fus3dmaps_core.config import Precision
+from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.encoders.graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.files import external_data

@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from fus3dmaps_core.config import Precision
+from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.engine_cache import Gpu, cached_engine
 from fus3dmaps_core.runtimes.graph_input import input_shape

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.config import SegmenterConfig
+from fus3dmaps_core.config.schema import SegmenterConfig
 from fus3dmaps_core.masks import Masks
 
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.segmentation import felzenszwalb
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.encoders.lite.detector import Detections, Detector, shared_detector
 from fus3dmaps_core.encoders.lite.evidence import box_iou
 from fus3dmaps_core.errors import EncoderError

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import cast
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.protocols import Segmenter
 

@@ -7,8 +7,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError, RecordingError
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.storage import TopicSummary
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from fus3dmaps_core import messages
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.input_config import InputConfig
+from fus3dmaps_core.messages import fields as messages
 from fus3dmaps_core.sources.paired import CameraModel, PairedMessages, UnregisteredDepth, check_size
 from fus3dmaps_core.sources.poses import FOREVER_NS, Moment, Mounting, PoseProvider
 from fus3dmaps_core.sources.streams import CameraTopics, InputStream, image_type

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core import messages
-from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.registration import register_depth
+from fus3dmaps_core.messages import fields as messages
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from fus3dmaps_core import messages
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
-from fus3dmaps_core.input_config import InputConfig
+from fus3dmaps_core.messages import fields as messages
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.poses import BufferedPoses, Mounting, PoseProvider, TransformPoses

@@ -8,10 +8,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core import messages
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_core.input_config import InputConfig
+from fus3dmaps_core.messages import fields as messages
 from fus3dmaps_core.sources.streams import pose_topic
 from fus3dmaps_core.sources.timeline import seconds
 from fus3dmaps_core.sources.transforms import NoTransform, TransformBuffer, TransformGap

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from fus3dmaps_core.input_config import InputConfig, QosProfile
+from fus3dmaps_core.config.input import InputConfig, QosProfile
 
 _POSE_TYPES = {
     "pose": "geometry_msgs/msg/PoseStamped",

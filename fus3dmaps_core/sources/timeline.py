@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from fus3dmaps_core import messages
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.messages import fields as messages
 
 _TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours; only another clock or a restart goes back this far.
 

@@ -9,9 +9,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core import messages
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
+from fus3dmaps_core.messages import fields as messages
 
 _KEEP_NS = 10_000_000_000  # As tf2 does: longer than any image waits.
 _TIME_JUMP_NS = 3_000_000_000

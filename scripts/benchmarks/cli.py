@@ -21,7 +21,7 @@ from benchmarks.measurements import print_tables, write_json
 from benchmarks.suite import QUICK_DIMENSIONS, QUICK_SIZES, SIZES, default_dtype, known_dtypes, measure_all, settings
 from benchmarks.timing import set_threads, usable_cores
 from benchmarks.workload import MIN_VOXELS, World
-from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.errors import ConfigError
 
 _SEED = 1

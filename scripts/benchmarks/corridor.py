@@ -25,7 +25,7 @@ from benchmarks.keyframes import (
 )
 from benchmarks.measurements import Measurement
 from fus3dmaps_core.geometry.projection import sample_pixels
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 WINDOW_RADIUS_M = 6.0
 DIMENSION = 384

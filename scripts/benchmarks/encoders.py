@@ -19,7 +19,7 @@ from typer.exceptions import TyperException
 from benchmarks.encoder_tables import print_models, with_ratios
 from benchmarks.model_figures import EXPORTING, Job
 from benchmarks.timing import usable_cores
-from fus3dmaps_core.config import Precision, Runtime
+from fus3dmaps_core.config.schema import Precision, Runtime
 from fus3dmaps_core.encoders import registry as encoders
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.errors import ConfigError, EncoderError

@@ -18,10 +18,10 @@ from benchmarks.keyframes import DenseKeyframe, ProposalKeyframe
 from benchmarks.measurements import Measurement, timed
 from benchmarks.timing import Times, collected_garbage, time_call, time_calls
 from benchmarks.workload import World, fill
-from fus3dmaps_core.config import MapConfig
-from fus3dmaps_core.layers.similarity import LAYERS
-from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.config.schema import MapConfig
+from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 ELEMENT_BYTES = {"float32": 4, "float16": 2, "int8": 1}
 _VOXELS_PER_INSTANCE = 400

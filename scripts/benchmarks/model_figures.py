@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 from benchmarks.timing import time_call
-from fus3dmaps_core.config import EncoderConfig, Precision, Runtime
+from fus3dmaps_core.config.schema import EncoderConfig, Precision, Runtime
 
 EXPORTING = ("onnxruntime", "tensorrt")
 """Runtimes that read graphs from files."""

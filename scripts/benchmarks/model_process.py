@@ -24,7 +24,7 @@ from benchmarks.random_weights import accept_random_weights, radio_code, write_p
 from benchmarks.segmenter_figures import measure_segmenter
 from fus3dmaps_core.encoders.catalogue import catalogue
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+from fus3dmaps_lab.simulation.room.furnished_room import FurnishedRoom
 
 _VIEW = 7  # Of the room's path: two photographs and furniture, near and far.
 REFUSED = 2

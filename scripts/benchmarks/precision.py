@@ -12,8 +12,8 @@ from benchmarks.boxes import VOXEL_SIZE_M
 from benchmarks.embeddings import NOISE, KnownText, unit_vectors
 from benchmarks.engine import Run
 from benchmarks.measurements import Measurement
-from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 VOXELS = 256
 OBSERVATIONS_PER_UPDATE = 5

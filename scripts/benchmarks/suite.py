@@ -24,7 +24,7 @@ from benchmarks.engine import (
 from benchmarks.measurements import Measurement
 from benchmarks.ratios import ratios
 from benchmarks.timing import copy_bandwidth
-from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.config.schema import MapConfig
 
 SIZES, QUICK_SIZES = (10_000, 100_000, 500_000, 2_000_000), (10_000, 200_000)
 DIMENSIONS, QUICK_DIMENSIONS = (384, 512, 1152), (512, 1152)

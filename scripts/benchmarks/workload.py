@@ -26,7 +26,7 @@ from benchmarks.keyframes import (
     part_labels,
     robot_path,
 )
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 KEYFRAMES = 12
 MIN_VOXELS = 10_000

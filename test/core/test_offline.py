@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from stand_ins import ColorSegmenter, color_trio, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.offline import map_info, map_recording
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.recordings.writer import RecordingWriter
-from fus3dmaps_core.storage import load_map, save_map
+from fus3dmaps_core.saved_maps.storage import load_map, save_map
 
 START_NS = 1_700_000_000_000_000_000
 POSITIONS_M = [0.0, 0.02, 0.1, 0.12, 0.2, 0.35]

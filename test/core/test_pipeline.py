@@ -10,11 +10,11 @@ import pytest
 import torch
 from stand_ins import ColorSegmenter, color_trio, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
 
 
 def make(**values) -> Pipeline:
@@ -229,7 +229,7 @@ def test_a_small_budget_costs_dense_voxels_and_nothing_else(caplog: pytest.LogCa
             dropped += report.dropped_dense_voxels
     missing = free.semantic_map.dense_voxel_count - bound.semantic_map.dense_voxel_count
     assert dropped >= missing > 1000  # What was dropped in front of the camera was seen and dropped again.
-    assert [record.name for record in caplog.records] == ["fus3dmaps_core.memory_budget"]
+    assert [record.name for record in caplog.records] == ["fus3dmaps_core.voxel_map.budget"]
     mine, full = bound.semantic_map.export_state(), free.semantic_map.export_state()
     for name in full:
         if name.startswith(("instance", "hypothesis", "voxel")):

@@ -7,7 +7,7 @@ import pytest
 from reference.agreement import assert_same_bytes
 from stand_ins import ColorSegmenter, color_trio, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.pipeline import Pipeline
 
 

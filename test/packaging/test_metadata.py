@@ -14,7 +14,7 @@ from packaging.utils import canonicalize_name
 
 import fus3dmaps_core
 
-OWN = {"fus3dmaps_core", "fus3dmaps_ros"}
+OWN = {"fus3dmaps_core", "fus3dmaps_lab", "fus3dmaps_ros"}
 
 
 def imported_modules(folder: Path) -> dict[str, Path]:
@@ -75,8 +75,9 @@ def test_build_types(manifest, interface_manifest):
     assert [group.name for group in interface_manifest.member_of_groups] == ["rosidl_interface_packages"]
 
 
-def test_core_imports_only_declared_packages_and_no_ros(root, distribution, manifest):
-    modules = imported_modules(root / "fus3dmaps_core")
+@pytest.mark.parametrize("package", ["fus3dmaps_core", "fus3dmaps_lab"])
+def test_core_and_laboratory_import_only_declared_packages_and_no_ros(root, distribution, manifest, package):
+    modules = imported_modules(root / package)
     assert undeclared(modules, declared_distributions(distribution)) == {}
     assert modules.keys() & exec_depends(manifest) == set()
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from fus3dmaps_core.config import Config, fields
+from fus3dmaps_core.config.schema import Config, fields
 
 ROOT = Path(__file__).resolve().parents[2]
 PRESETS = sorted((ROOT / "config" / "presets").glob("*.yaml"))

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.errors import QueryError
-from fus3dmaps_core.query import TextQuery, answer_query
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from reference.objects import box_m, centroid_m, occupied_voxels
 from reference.queries import layer_embeddings, ranking, similarity_of_voxels
 from reference.semantic_map import Fusion, ReferenceMap

@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import torch
 
-from fus3dmaps_core.kernels.protocols import Hypotheses
+from fus3dmaps_core.voxel_map.kernels.protocols import Hypotheses
 
 
 def columns(held: list[dict[int, int]], places: int, id_of_row: list[int], device: torch.device, rng) -> Hypotheses:

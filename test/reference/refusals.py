@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from reference.agreement import assert_same_bytes, engine_of
 from reference.steps import Setting, random_steps
 

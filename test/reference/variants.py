@@ -6,8 +6,8 @@ from importlib.util import find_spec
 
 import torch
 
-from fus3dmaps_core.kernels.protocols import Kernels
-from fus3dmaps_core.kernels.selection import select_kernels
+from fus3dmaps_core.voxel_map.kernels.protocols import Kernels
+from fus3dmaps_core.voxel_map.kernels.selection import select_kernels
 
 DEVICES = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
 BACKENDS = tuple(

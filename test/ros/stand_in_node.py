@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from stand_ins import DIMENSION, ColorEncoder, ColorSegmenter
 
-from fus3dmaps_core import storage
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_core.saved_maps import storage
 from fus3dmaps_ros.mapper_node import main
 
 

@@ -16,11 +16,11 @@ from robot import Robot, camera_info_message, depth_message, pose_message, stand
 from sensor_msgs.msg import CameraInfo
 from stand_ins import wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.registration import register_depth
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 10**8

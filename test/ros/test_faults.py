@@ -28,10 +28,10 @@ from robot import (
 from stand_ins import wall_frame
 
 from fus3dmaps_core.frame import PosedFrame
-from fus3dmaps_core.map_directory import map_path
-from fus3dmaps_core.storage import load_map
+from fus3dmaps_core.saved_maps.directory import map_path
+from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText, SaveMap
-from fus3dmaps_ros.services import SERVICE_QOS
+from fus3dmaps_ros.services.serving import SERVICE_QOS
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
@@ -306,7 +306,7 @@ def test_a_full_disk_refuses_the_save_and_the_last_map_stays(heard, tmp_path, mo
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr("fus3dmaps_core.storage_files.np.save", no_space)
+        patched.setattr("fus3dmaps_core.saved_maps.files.np.save", no_space)
         robot.map(wall_frame(START_NS + SECOND_NS, x_m=0.5))
         reply = robot.call(SaveMap, "save_map", name="home")
     assert not reply.success

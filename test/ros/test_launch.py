@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import yaml
 
-from fus3dmaps_core.config import Config, fields
+from fus3dmaps_core.config.schema import Config, fields
 from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.mapper_node import NODE_NAME
 
@@ -198,7 +198,7 @@ def test_rviz_finds_a_mapper_in_a_namespace(description, namespace) -> None:
 def published() -> dict[str, str]:
     """Type by topic of everything that the sources of the node publish, at the node's name without a namespace."""
     found: dict[str, str] = {}
-    for path in (ROOT / "fus3dmaps_ros").glob("*.py"):
+    for path in (ROOT / "fus3dmaps_ros").rglob("*.py"):
         if path.name == "player_node.py":
             continue
         for call in ast.walk(ast.parse(path.read_text())):

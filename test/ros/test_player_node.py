@@ -26,7 +26,7 @@ from fus3dmaps_core.recordings.storage import RawMessage, TopicSummary
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_ros import player_node
 from fus3dmaps_ros.player_node import Player
-from fus3dmaps_ros.transport import enlarge_shared_memory
+from fus3dmaps_ros.topics.transport import enlarge_shared_memory
 
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 100_000_000

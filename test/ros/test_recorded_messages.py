@@ -8,8 +8,8 @@ from rclpy.serialization import deserialize_message
 from recorded_frames import assert_same_frames, noise_frames
 from sensor_msgs.msg import CameraInfo, Image
 
-from fus3dmaps_core.config import ImageConfig
-from fus3dmaps_core.input_config import InputConfig
+from fus3dmaps_core.config.input import InputConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.sources.pairing import FramePairer

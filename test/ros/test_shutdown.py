@@ -17,10 +17,10 @@ from sensor_msgs.msg import CameraInfo, Image
 from stand_ins import wall_frame
 
 from fus3dmaps_core.frame import PosedFrame
-from fus3dmaps_core.map_directory import list_maps, map_path
-from fus3dmaps_core.storage import load_map
+from fus3dmaps_core.saved_maps.directory import list_maps, map_path
+from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText
-from fus3dmaps_ros.inputs import input_qos
+from fus3dmaps_ros.topics.inputs import input_qos
 
 START_NS = 1_700_000_000 * 10**9
 FRAMES = [wall_frame(START_NS + number * 10**8, x_m=0.5 * number) for number in range(4)]

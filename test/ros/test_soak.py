@@ -16,8 +16,8 @@ from pathlib import Path
 from robot import TIMEOUT_S, Robot, wait_until
 from stand_ins import wall_frame
 
-from fus3dmaps_core.map_directory import map_path
-from fus3dmaps_core.storage import load_map
+from fus3dmaps_core.saved_maps.directory import map_path
+from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText, SaveMap
 
 SECOND_NS = 10**9

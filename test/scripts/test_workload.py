@@ -10,9 +10,9 @@ from benchmarks.embeddings import ObservedObjects
 from benchmarks.keyframes import DEPTH_NOISE_M, look_ahead, robot_path
 from benchmarks.workload import KEYFRAMES, MIN_VOXELS, World, fill, instance_labels
 
-from fus3dmaps_core.config import MapConfig
+from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.geometry.projection import sample_pixels
-from fus3dmaps_core.semantic_map import SemanticMap
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 
 def as_set(voxels: np.ndarray) -> set:

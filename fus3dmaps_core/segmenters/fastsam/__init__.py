@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from fus3dmaps_core.config import EncoderConfig, Precision
+from fus3dmaps_core.config.schema import EncoderConfig, Precision
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.runtimes.example_images import pictures
 from fus3dmaps_core.runtimes.foreign_graphs import in_precision

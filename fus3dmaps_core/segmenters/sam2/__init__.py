@@ -7,7 +7,7 @@ decoder, which takes many times what FastSAM takes for the whole image. ``segmen
 
 from __future__ import annotations
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.segmenters.sam2.network import load_sam2
 from fus3dmaps_core.segmenters.sam2.segmenter import Sam2Segmenter

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from reference.projection import patch_of_pixel, project_point, unproject_pixel, valid_depth
 from scipy.spatial.transform import Rotation
 
-from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.geometry.projection import resize_frame, sample_pattern, sample_pixels, unproject
 

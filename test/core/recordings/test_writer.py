@@ -11,9 +11,9 @@ from recorded_frames import PERIOD_NS, START_NS, noise_frames
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import PosedFrame
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.recordings.writer import CAMERA_FRAME, RecordingWriter
 
 TYPES = {

@@ -9,7 +9,7 @@ import torch
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
 from fus3dmaps_core.segmenters.fastsam.proposals import MAX_PROPOSALS, masks_of, select

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fus3dmaps_core.config import SegmenterConfig
+from fus3dmaps_core.config.schema import SegmenterConfig
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.filtering import border_contact, filter_masks
 

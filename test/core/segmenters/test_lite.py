@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import skimage.data
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.encoders.lite.evidence import box_iou
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.lite import LiteSegmenter

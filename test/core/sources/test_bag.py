@@ -11,10 +11,10 @@ from recorded_frames import PERIOD_NS, START_NS, assert_same_frames, noise_frame
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as RosbagsWriter
 
-from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.config.input import InputConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.frame import PosedFrame
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.sources.bag import BagSource
 

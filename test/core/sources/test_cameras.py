@@ -10,11 +10,11 @@ from compressed_messages import compressed_depth_png, compressed_depth_rvl, dept
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fus3dmaps_core.config import Config, ImageConfig
+from fus3dmaps_core.config.input import InputConfig
+from fus3dmaps_core.config.schema import Config, ImageConfig
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.registration import register_depth
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.sources.pairing import FramePairer
 from fus3dmaps_core.sources.transforms import TransformTree
 

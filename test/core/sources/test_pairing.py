@@ -8,9 +8,9 @@ import ros_messages as ros
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from fus3dmaps_core.config import ImageConfig
+from fus3dmaps_core.config.input import InputConfig
+from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.sources.pairing import FramePairer
 
 MS = 1_000_000

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import ros_messages as ros
 
+from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_core.input_config import InputConfig
 from fus3dmaps_core.sources.pairing import FramePairer
 from fus3dmaps_core.sources.transforms import TransformTree
 

@@ -10,9 +10,9 @@ import pytest
 from ros.conftest import signals, start, user  # noqa: F401  (fixtures)
 from weights_cache import WeightsCache, expect_random_weights, write_weights
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.recordings.writer import RecordingWriter
-from fus3dmaps_core.sources.furnished_room import FurnishedRoom
+from fus3dmaps_lab.simulation.room.furnished_room import FurnishedRoom
 
 FRAMES = 2
 SETTINGS = {

@@ -15,18 +15,18 @@ from node_process import RELIABLE_ARGUMENTS, end
 from reference.agreement import assert_same_bytes
 from robot import TIMEOUT_S, wait_until
 
+from fus3dmaps_core.answers.query import LAYERS, TextQuery, answer_query
 from fus3dmaps_core.encoders.registry import card, load_text_encoder, names
 from fus3dmaps_core.errors import QueryError, StorageError
 from fus3dmaps_core.offline import map_info, map_recording
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import LAYERS, TextQuery, answer_query
-from fus3dmaps_core.storage import load_map, restore_map, save_map
+from fus3dmaps_core.saved_maps.storage import load_map, restore_map, save_map
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_msgs.srv import Fuse, LoadMap, QueryText, SaveMap
-from fus3dmaps_ros import cli
-from fus3dmaps_ros.conversions import from_cloud
-from fus3dmaps_ros.outputs import LATCHED
+from fus3dmaps_ros.commands import cli
 from fus3dmaps_ros.player_node import play
+from fus3dmaps_ros.topics.conversions import from_cloud
+from fus3dmaps_ros.topics.outputs import LATCHED
 
 NODE = Path(__file__).with_name("random_weights_node.py")
 FRAMES = 2  # Of the recording, as conftest.py writes it.

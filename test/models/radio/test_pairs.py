@@ -11,13 +11,13 @@ from pair_maps import map_with_pooled_patches
 from reference.radio_attention import LAYER_EPSILON, gelu, last_block, layer_norm, neighbourhood, project, recursive
 from stand_ins import ColorSegmenter, wall_frame
 
-from fus3dmaps_core.config import Config
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
 from fus3dmaps_core.encoders.radio.pair import load_networks, make_trio
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
 
 TEACHER = 1  # The pair's teacher is the second of the checkpoint's, and so is its summary token.
 MEAN, STD = np.array([0.48145466, 0.4578275, 0.40821073]), np.array([0.26862954, 0.26130258, 0.27577711])

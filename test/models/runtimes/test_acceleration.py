@@ -13,7 +13,7 @@ import torch
 from graph_trios import boxes, toy_trio
 from tensorrt_stand_in import Stream, TensorRT
 
-from fus3dmaps_core.config import EncoderConfig, ImageConfig
+from fus3dmaps_core.config.schema import EncoderConfig, ImageConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes import acceleration, engine_cache, exporting, tensorrt_network
 from fus3dmaps_core.runtimes.acceleration import accelerate

@@ -11,10 +11,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from stand_ins import color_trio, wall_frame
 
-from fus3dmaps_core.config import Config, EncoderConfig
+from fus3dmaps_core.answers.query import TextQuery, answer_query
+from fus3dmaps_core.config.schema import Config, EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.query import TextQuery, answer_query
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
 from fus3dmaps_core.segmenters import fastsam
 from fus3dmaps_core.segmenters.registry import load_segmenter

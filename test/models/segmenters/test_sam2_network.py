@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 from transformers import Sam2ImageProcessor, Sam2VideoConfig, Sam2VideoModel
 
-from fus3dmaps_core.config import EncoderConfig
+from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.segmenters.registry import load_segmenter
 from fus3dmaps_core.segmenters.sam2.network import build_sam2, load_sam2

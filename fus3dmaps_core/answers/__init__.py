@@ -1,0 +1,1 @@
+"""What the map answers: ranked instances, labels, pictures."""

@@ -1,0 +1,1 @@
+"""Parameters: one schema, with units, ranges and words."""

@@ -1,0 +1,1 @@
+"""What is wrong with the inputs or the mapping, in words."""

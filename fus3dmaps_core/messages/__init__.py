@@ -1,0 +1,1 @@
+"""Decoding of ROS messages, without ROS."""

@@ -1,0 +1,123 @@
+"""From ROS messages to arrays, without ROS: anything that has a message's fields will do.
+
+The functions take images, ``sensor_msgs/CameraInfo`` and poses as rclpy delivers them or as rosbags deserialises them. Every
+refusal is a FrameError whose message names the topic. Images are decoded in :mod:`fus3dmaps_core.messages.images`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.frame import Intrinsics
+from fus3dmaps_core.geometry.distortion import Distortion
+from fus3dmaps_core.messages.images import about, check_color, check_depth, decode_color, decode_depth, image_size
+
+__all__ = [
+    "check_color",
+    "check_depth",
+    "decode_color",
+    "decode_depth",
+    "image_size",
+    "stamp_ns",
+    "to_distortion",
+    "to_intrinsics",
+    "to_pose",
+    "transform_from",
+    "transform_of",
+]
+
+_QUATERNION_TOLERANCE = 1e-2  # Publishers round; farther from unit length is not a rotation but a bug or an unset field.
+
+
+def stamp_ns(message: Any) -> int:
+    """The stamp of a message's header, nanoseconds since the epoch of its clock."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
+
+
+def to_intrinsics(message: Any, topic: str) -> Intrinsics:
+    """The pinhole model of a ``CameraInfo``, for the image as published: region of interest and binning are applied.
+
+    The raw camera matrix K is used; :func:`to_distortion` gives what the lens adds to it.
+
+    Raises:
+        FrameError: Reason ``bad_intrinsics``: a focal length or size is not positive, or a value not finite.
+    """
+    fx, _, cx, _, fy, cy = (float(value) for value in tuple(message.k)[:6])
+    width, height = int(message.width), int(message.height)
+    roi = message.roi
+    if roi.width and roi.height:
+        cx, cy, width, height = cx - roi.x_offset, cy - roi.y_offset, int(roi.width), int(roi.height)
+    with about(topic):
+        full = Intrinsics(fx, fy, cx, cy, width, height)
+        return full.resized(width // max(int(message.binning_x), 1), height // max(int(message.binning_y), 1))
+
+
+def to_distortion(message: Any, topic: str) -> Distortion | None:
+    """The lens distortion of a ``CameraInfo``, None where the image needs no rectification.
+
+    It goes with :func:`to_intrinsics`: coefficients are of rays, not of pixels, so neither region of interest nor binning
+    changes them. None means an unset model or coefficients that are all 0, as ROS reads it: also of ``equidistant``.
+
+    Raises:
+        FrameError: Reason ``bad_intrinsics``: an unknown model, a wrong number of coefficients or a value not finite.
+    """
+    model = str(message.distortion_model)
+    coefficients = tuple(float(value) for value in message.d)
+    with about(topic):
+        if not np.all(np.isfinite(coefficients)):
+            raise FrameError(f"distortion coefficients {coefficients} are not finite", reason="bad_intrinsics")
+        if not model or not any(coefficients):
+            return None
+        return Distortion(model, coefficients)
+
+
+def to_pose(message: Any, topic: str) -> NDArray[np.float64]:
+    """The pose of a ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry`` in its header's frame, (4, 4) float64.
+
+    Raises:
+        FrameError: Reason ``bad_pose``: a value is not finite, or the quaternion's length is off 1 by more than 0.01.
+    """
+    pose = message.pose
+    pose = getattr(pose, "pose", pose)  # The latter two wrap it with a covariance.
+    with about(topic):
+        return _transform(pose.position, pose.orientation)
+
+
+def transform_of(message: Any, topic: str) -> NDArray[np.float64]:
+    """The transform of a ``TransformStamped``, (4, 4) float64: the pose of its child frame in its header's frame.
+
+    Raises:
+        FrameError: As :func:`to_pose`.
+    """
+    with about(topic):
+        return _transform(message.transform.translation, message.transform.rotation)
+
+
+def transform_from(values: tuple[float, ...] | list[float]) -> NDArray[np.float64]:
+    """The (4, 4) transform of x, y, z (metres), qx, qy, qz, qw; the quaternion is normalised.
+
+    Raises:
+        FrameError: As :func:`to_pose`.
+    """
+    vector = np.asarray(values, dtype=np.float64)
+    if not np.all(np.isfinite(vector)):
+        raise FrameError(f"pose is not finite: {vector.tolist()}", reason="bad_pose")
+    length = float(np.linalg.norm(vector[3:]))
+    if abs(length - 1.0) > _QUATERNION_TOLERANCE:
+        raise FrameError(
+            f"quaternion {vector[3:].tolist()} has length {length:.4g}, which is not a rotation", reason="bad_pose"
+        )
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_quat(vector[3:] / length).as_matrix()
+    T[:3, 3] = vector[:3]
+    return T
+
+
+def _transform(position: Any, orientation: Any) -> NDArray[np.float64]:
+    return transform_from((position.x, position.y, position.z, orientation.x, orientation.y, orientation.z, orientation.w))

@@ -1,0 +1,1 @@
+"""The laboratory: datasets, simulation and evaluation. It imports the core; the core never imports it."""

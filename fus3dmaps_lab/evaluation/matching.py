@@ -1,0 +1,174 @@
+"""Which voxels of a map speak for a voxel of the truth: its nearest ones, whatever lies between."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.voxel_map.kernels.keys import pack
+from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth
+
+_BLOCK_ROWS = 2**14
+_SPARE = 8  # Neighbours asked for beyond k, so that most ties at the last place are seen at once.
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """The nearest voxels of a map, nearest first; of equally near ones, those of lower x, then y, then z.
+
+    Attributes:
+        places: (n, k) int64, where in the map's voxels; fewer columns if the map has fewer than k.
+        distances: (n, k) float64, between centres, in voxels.
+    """
+
+    places: NDArray[np.int64]
+    distances: NDArray[np.float64]
+
+
+def nearest_voxels(
+    positions: NDArray[np.number], predicted_keys: NDArray[np.integer], k: int, workers: int = -1
+) -> Neighbours:
+    """The k nearest voxels of a map to each position. The result does not depend on the order of voxels.
+
+    Args:
+        positions: (n, 3) on the map's grid, in voxels; whole or half numbers (:attr:`VoxelTruth.positions`).
+        predicted_keys: (m, 3) voxel indices of the map, all different.
+        k: How many.
+        workers: Threads; -1 takes all processors.
+
+    Raises:
+        MapError: A position is neither a whole nor a half number, or k is less than 1.
+    """
+    if k < 1:
+        raise MapError(f"k: must be at least 1, got {k}")
+    doubled = np.rint(2 * np.asarray(positions, np.float64))
+    if not np.array_equal(doubled, 2 * np.asarray(positions, np.float64)):
+        raise MapError("positions: must be whole or half numbers of voxels")
+    count = min(k, len(predicted_keys))
+    places = np.empty((len(doubled), count), np.int64)
+    squares = np.empty((len(doubled), count), np.int64)
+    if count and len(doubled):
+        order = np.argsort(pack(torch.from_numpy(np.ascontiguousarray(predicted_keys, np.int64))).numpy())
+        # Not balanced: positions far outside of the map are then looked up twice as fast.
+        tree = cKDTree(2.0 * predicted_keys[order], balanced_tree=False)
+        for first in range(0, len(doubled), _BLOCK_ROWS):
+            rows = slice(first, first + _BLOCK_ROWS)
+            squares[rows], ranks = _nearest(tree, doubled[rows], count, workers)
+            places[rows] = order[ranks]
+    return Neighbours(places, np.sqrt(squares) / 2)
+
+
+def match_predictions(
+    truth_keys: NDArray[np.number],
+    predicted_keys: NDArray[np.integer],
+    predicted_classes: NDArray[np.integer],
+    k: int = 5,
+) -> NDArray[np.int32]:
+    """Predicted class of each voxel of the truth.
+
+    Args:
+        truth_keys: (n, 3) voxel indices on the map's grid, or half numbers where the truth's voxels lie between
+            (:attr:`VoxelTruth.positions`).
+        predicted_keys: (m, 3) voxel indices of the map, all different.
+        predicted_classes: (m,) class of each, 0 for none.
+        k: The class is the mode of that many nearest voxels, however far they are; 0 takes the very same voxel.
+
+    Returns:
+        (n,) int32; 0 where the prediction is none, or missing.
+
+    Raises:
+        MapError: With k = 0 the truth is not on the map's grid.
+    """
+    if k == 0:
+        same = same_voxels(truth_keys, predicted_keys)
+        classes = np.append(np.asarray(predicted_classes, np.int32), np.int32(0))
+        return classes[same]
+    return mode_of_neighbours(nearest_voxels(truth_keys, predicted_keys, k), predicted_classes)
+
+
+def mode_of_neighbours(neighbours: Neighbours, predicted_classes: NDArray[np.integer]) -> NDArray[np.int32]:
+    """The most frequent class among the neighbours, none (0) being one like any other; ties: the lowest number.
+
+    That is what ``torch.mode`` gives, which the published protocol takes.
+
+    Args:
+        neighbours: Of n positions.
+        predicted_classes: (m,) class of each voxel of the map.
+
+    Returns:
+        (n,) int32, 0 where there is no neighbour.
+    """
+    mode = np.zeros(len(neighbours.places), np.int32)
+    if not neighbours.places.shape[1]:
+        return mode
+    for first in range(0, len(mode), _BLOCK_ROWS):
+        rows = slice(first, first + _BLOCK_ROWS)
+        classes = np.sort(np.asarray(predicted_classes, np.int32)[neighbours.places[rows]], axis=1)
+        frequency = np.zeros(classes.shape, np.int32)
+        for column in range(classes.shape[1]):
+            frequency += classes == classes[:, column, None]
+        # Sorted, so that the first of the most frequent is the lowest.
+        mode[rows] = classes[np.arange(len(classes)), frequency.argmax(axis=1)]
+    return mode
+
+
+def seen_truth(truth: VoxelTruth, seen_keys: NDArray[np.integer], reach_voxels: float = 2.0) -> VoxelTruth:
+    """The part of a truth that a map can know of, where the truth has more than was ever seen.
+
+    Args:
+        truth: Of everything.
+        seen_keys: (m, 3) voxel indices of a map that has seen all that there was to see, all different.
+        reach_voxels: How far a voxel of the truth may be from the nearest of these, in voxels.
+    """
+    near = nearest_voxels(truth.positions, seen_keys, 1)
+    kept = np.any(near.distances <= reach_voxels, axis=1)
+    return replace(truth, keys=truth.keys[kept], classes=truth.classes[kept], instances=truth.instances[kept])
+
+
+def same_voxels(positions: NDArray[np.number], predicted_keys: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Where in the map's voxels each position is, -1 for one that the map lacks.
+
+    Args:
+        positions: (n, 3) voxel indices.
+        predicted_keys: (m, 3) voxel indices of the map, all different.
+
+    Raises:
+        MapError: A position is not a voxel of the grid.
+    """
+    keys = np.asarray(positions).astype(np.int64)
+    if not np.array_equal(keys, positions):
+        raise MapError("k: 0 needs a truth on the map's own grid, with the rounding 'floor'")
+    if not len(predicted_keys):
+        return np.full(len(keys), -1, np.int64)
+    wanted, held = (pack(torch.from_numpy(np.ascontiguousarray(each, np.int64))).numpy() for each in (keys, predicted_keys))
+    order = np.argsort(held)
+    place = np.minimum(np.searchsorted(held, wanted, sorter=order), len(held) - 1)
+    return np.where(held[order[place]] == wanted, order[place], -1)
+
+
+def _nearest(
+    tree: cKDTree, points: NDArray[np.float64], count: int, workers: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Squared distances and ranks of the nearest ``count`` points of the tree, of equally near ones the lowest ranks."""
+    squares = np.empty((len(points), count), np.int64)
+    ranks = np.empty((len(points), count), np.int64)
+    left, asked = np.arange(len(points)), count + _SPARE
+    while len(left):
+        asked = min(asked, tree.n)
+        distances, found = tree.query(points[left], k=np.arange(1, asked + 1), workers=workers)
+        # Between whole numbers: exact once rounded, for the root is off by less than the squares are apart.
+        exact = np.rint(distances**2).astype(np.int64)
+        by_rank = np.argsort(found, axis=1)
+        exact, found = (np.take_along_axis(each, by_rank, axis=1) for each in (exact, found))
+        chosen = np.argsort(exact, axis=1, kind="stable")
+        exact, found = (np.take_along_axis(each, chosen, axis=1) for each in (exact, found))
+        squares[left], ranks[left] = exact[:, :count], found[:, :count]
+        # Where the last that was seen is as near as the last that is taken, there may be equally near ones unseen.
+        left = left[exact[:, -1] == exact[:, count - 1]] if asked < tree.n else left[:0]
+        asked *= 2
+    return squares, ranks

@@ -1,0 +1,100 @@
+"""Studies of several seeds at once, each in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import replace
+from queue import Empty
+from typing import Any
+
+from fus3dmaps_lab.evaluation.memory_study import MemoryStudy, memory_curves
+from fus3dmaps_lab.evaluation.records import CurvePoint, Record
+from fus3dmaps_lab.evaluation.simulation import ASSOCIATIONS, Study, study_building
+
+MODES_ONLY = Study(rooms_per_storey=6, frames=300)
+"""The modes alone."""
+
+QUICK = Study(rooms_per_storey=4, frames=160)
+"""The modes alone, in a smaller building."""
+
+WHOLE = replace(
+    MODES_ONLY, noise_ratios=(0.2, 1.0, 5.0), window_radii_m=(1.5, 3.0, 4.5, 6.0, 9.0), associations=ASSOCIATIONS
+)
+"""Modes and all sweeps."""
+
+_POLL_S = 0.2
+
+Progress = Callable[[int, int], object]
+
+
+def study_seeds(
+    study: Study, seeds: Sequence[int], jobs: int = 0, on_progress: Progress | None = None
+) -> tuple[list[Record], list[CurvePoint]]:
+    """Study one building for each seed.
+
+    Args:
+        study: What is built and compared.
+        seeds: Of the buildings.
+        jobs: How many are studied at once; 0 for as many as there are processors. The results are the same.
+        on_progress: Called with the number of frames mapped, and of all.
+
+    Returns:
+        Records and points of curves, in the order of seeds.
+    """
+    results = _each(study_building, [(study, seed) for seed in seeds], jobs, on_progress)
+    return [each for records, _ in results for each in records], [each for _, points in results for each in points]
+
+
+def memory_of(
+    study: MemoryStudy, seeds: Sequence[int], jobs: int = 1, on_progress: Progress | None = None
+) -> list[CurvePoint]:
+    """Points of the memory experiment for each seed; one at a time by default, for a map may take gigabytes.
+
+    Args:
+        study: What is built.
+        seeds: Of the buildings.
+        jobs: As in :func:`study_seeds`.
+        on_progress: As there.
+    """
+    return [
+        point for points in _each(memory_curves, [(study, seed) for seed in seeds], jobs, on_progress) for point in points
+    ]
+
+
+def _each(
+    work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], jobs: int, on_progress: Progress | None
+) -> list[Any]:
+    """Results of calls in processes of their own, in order."""
+    context = multiprocessing.get_context("spawn")  # Threads of torch and numba do not survive a fork.
+    with context.Manager() as manager:
+        messages = manager.Queue()
+        workers = max(1, min(jobs or os.cpu_count() or 1, len(arguments)))
+        with ProcessPoolExecutor(workers, mp_context=context) as pool:
+            futures = [pool.submit(_reporting, work, messages, place, each) for place, each in enumerate(arguments)]
+            _follow(futures, messages, on_progress)
+            return [future.result() for future in futures]
+
+
+def _follow(futures: list[Future[Any]], messages: Any, on_progress: Progress | None) -> None:
+    pending = set(futures)
+    shares: dict[int, tuple[int, int]] = {}
+    while pending:
+        done, pending = wait(pending, _POLL_S, FIRST_COMPLETED)
+        for future in done:
+            future.result()  # The first failure ends it all.
+        try:
+            while True:
+                place, frames, total = messages.get_nowait()
+                shares[place] = frames, total
+        except Empty:
+            pass
+        if on_progress is not None and shares:
+            longest = max(total for _, total in shares.values())
+            on_progress(sum(frames for frames, _ in shares.values()), max(longest * len(futures), 1))
+
+
+def _reporting(work: Callable[..., Any], messages: Any, place: int, arguments: tuple[Any, ...]) -> Any:
+    return work(*arguments, lambda frames, total: messages.put((place, frames, total)))

@@ -1,0 +1,1 @@
+"""Plain buildings of many rooms whose every surface is labelled."""

@@ -1,0 +1,1 @@
+"""Encoders and a segmenter with stated statistics, which know the simulated truth."""

@@ -1,0 +1,1 @@
+"""A furnished room with photographs on its walls."""

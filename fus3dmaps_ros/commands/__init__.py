@@ -1,0 +1,1 @@
+"""The ``fus3dmaps`` command, its sub-commands and the client."""

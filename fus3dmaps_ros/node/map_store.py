@@ -1,0 +1,88 @@
+"""Saving the map of a session and going on from a saved one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from fus3dmaps_core.errors import StorageError
+from fus3dmaps_core.offline import map_info
+from fus3dmaps_core.saved_maps.directory import list_maps, map_path, map_root
+from fus3dmaps_core.saved_maps.manifest import MANIFEST, read_manifest
+from fus3dmaps_core.saved_maps.storage import MapInfo, restore_map, save_map
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
+from fus3dmaps_ros.node.session import Session
+
+
+def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
+    """Save the map as it stands; mapping goes on meanwhile.
+
+    Args:
+        session: Whose map.
+        root: Directory of saved maps.
+        name: The map's name in it.
+
+    Returns:
+        Where it is, and its bytes on disk.
+
+    Raises:
+        StorageError: The name cannot be one, or the map cannot be written; a map that was there still is.
+    """
+    path = map_path(root, name)
+    # Before the map is copied: what is saved may be newer than the stamp, never older.
+    info = map_info(session.pipeline)
+    return path, save_map(path, session.pipeline.semantic_map, info)
+
+
+def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:
+    """Read a saved map into one like the session's, which goes on as it is.
+
+    Raises:
+        StorageError: It is no map, damaged, or does not fit the session; the message names what differs.
+    """
+    pipeline = session.pipeline
+    fresh = pipeline.empty_map()
+    return fresh, restore_map(path, fresh, pipeline.config, pipeline.trio.name)
+
+
+def named_map(root: str, name: str) -> Path:
+    """Path of the map of a name, or without a name of the one that was saved last.
+
+    Raises:
+        StorageError: There is no such map, or the name cannot be one.
+    """
+    if name:
+        return map_path(root, name)
+    names = list_maps(root)
+    if not names:
+        raise StorageError(f"no map is saved in '{root}'")
+    return map_path(root, names[0])
+
+
+def read_newest(session: Session, root: str, warn: Callable[[str], object]) -> tuple[str, SemanticMap, MapInfo] | None:
+    """The newest saved map that is good.
+
+    Args:
+        session: What it must fit.
+        root: Directory of saved maps.
+        warn: Is told of each map that is passed over, and why.
+
+    Returns:
+        Its name, the map and what else is known of it; None where there is none.
+    """
+    try:
+        names = list_maps(root)
+    except StorageError as error:
+        warn(f"no map is resumed: {error}")
+        return None
+    for damaged in sorted({path.parent.name for path in map_root(root).glob(f"*/{MANIFEST}")} - set(names)):
+        try:
+            read_manifest(map_path(root, damaged))
+        except StorageError as error:
+            warn(f"map '{damaged}' is not resumed: {error}")
+    for name in names:
+        try:
+            return (name, *read_map(session, map_path(root, name)))
+        except StorageError as error:
+            warn(f"map '{name}' is not resumed: {error}")
+    return None

@@ -1,0 +1,171 @@
+"""ROS parameters from the configuration schema: declared once, with description, bounds, and when they can change."""
+
+from __future__ import annotations
+
+import difflib
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import annotated_types
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from fus3dmaps_core.config.schema import Config, fields
+from fus3dmaps_core.errors import ConfigError
+
+RUNTIME = frozenset(
+    {
+        "segmenter.min_area_px",
+        "segmenter.max_border_contact",
+        "segmenter.max_masks",
+        "keyframes.dense_translation_m",
+        "keyframes.dense_rotation_rad",
+        "keyframes.instance_translation_m",
+        "keyframes.instance_rotation_rad",
+        "map.memory_budget_mib",
+        "fusion.period_frames",
+        "query.top_k",
+        "query.min_voxels",
+        "node.publish_period_s",
+        "node.status_period_s",
+        "node.service_timeout_s",
+        "node.map_directory",
+        "node.autosave_period_s",
+    }
+)
+"""Keys that can be changed at any time. All others shape the models, the map or the graph, and can be changed while the node
+is unconfigured."""
+
+FIXED = frozenset({"node.autostart"})
+"""Keys that only matter at the start."""
+
+_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+    list: Parameter.Type.DOUBLE_ARRAY,
+}
+_ARRAYS = (Parameter.Type.DOUBLE_ARRAY,)
+_INT64_MAX = 2**63 - 1
+
+
+def declare_parameters(node: Node) -> Config:
+    """Declare every key of the schema on a node and read the values it was started with.
+
+    Raises:
+        ConfigError: A value is of the wrong type or out of range; the message names the parameter.
+    """
+    values: dict[str, Any] = {}
+    for key, field in fields().items():
+        try:
+            value = node.declare_parameter(key, field.default, _descriptor(key, field)).value
+        except InvalidParameterTypeException:
+            given = node._parameter_overrides[key]
+            raise ConfigError(
+                f"parameter '{key}': expects {_TYPES[type(field.default)].name.lower()}, "
+                f"got {given.type_.name.lower()} {given.value!r}"
+            ) from None
+        except InvalidParameterValueException as error:
+            raise ConfigError(f"parameter '{key}': {error}") from None
+        values[key] = list(value) if isinstance(field.default, list) else value
+    return Config.from_flat(values)
+
+
+def unknown_overrides(node: Node) -> list[str]:
+    """A sentence for every parameter the node was given in one of the schema's sections but that the schema lacks."""
+    known = list(fields())
+    sections = {key.partition(".")[0] for key in known}
+    sentences = []
+    for key in sorted(node._parameter_overrides):
+        if key not in fields() and key.partition(".")[0] in sections:
+            close = difflib.get_close_matches(key, known, n=1)
+            sentences.append(
+                f"parameter '{key}' is unknown and ignored" + (f"; did you mean '{close[0]}'?" if close else "")
+            )
+    return sentences
+
+
+def follow_changes(
+    node: Node,
+    read: Callable[[], Config],
+    apply: Callable[[Config], None],
+    is_configured: Callable[[], bool] = lambda: True,
+) -> None:
+    """Check parameters that are set at run time against the schema and hand on the new configuration.
+
+    Args:
+        node: Whose parameters to watch.
+        read: Gives the configuration in force.
+        apply: Takes the new one.
+        is_configured: Whether the node has models and a map, which parameters outside of RUNTIME would not fit any more.
+    """
+    known = fields()
+
+    def changed(parameters: list[Parameter]) -> Config:
+        values = {item.name: list(item.value) if item.type_ in _ARRAYS else item.value for item in parameters}
+        return read().with_values({key: value for key, value in values.items() if key in known})
+
+    def check(parameters: list[Parameter]) -> SetParametersResult:
+        try:
+            new, present = changed(parameters).flat(), read().flat()
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        for key in known:
+            if new[key] != present[key] and key not in RUNTIME and is_configured():
+                return SetParametersResult(
+                    successful=False,
+                    reason=f"parameter '{key}' can be changed only while the node is unconfigured: deactivate and clean up"
+                    " first, or start the node with it",
+                )
+        return SetParametersResult(successful=True)
+
+    node.add_on_set_parameters_callback(check)
+    node.add_post_set_parameters_callback(lambda parameters: apply(changed(parameters)))
+
+
+def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(description=field.description or "", read_only=key in FIXED)
+    lower: float | None = None
+    upper: float | None = None
+    exclusive = []
+    for bound in field.metadata:
+        match bound:
+            case annotated_types.Ge(ge=limit):
+                lower = limit  # type: ignore[assignment]
+            case annotated_types.Gt(gt=limit):
+                lower = limit  # type: ignore[assignment]
+                exclusive.append(f"> {limit}")
+            case annotated_types.Le(le=limit):
+                upper = limit  # type: ignore[assignment]
+            case annotated_types.Lt(lt=limit):
+                upper = limit  # type: ignore[assignment]
+                exclusive.append(f"< {limit}")
+    # ROS ranges are closed; the schema refuses the open end itself.
+    when = [] if key in RUNTIME | FIXED else ["changes only while the node is unconfigured"]
+    descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive, *when])
+    if lower is None and upper is None:
+        return descriptor
+    if isinstance(field.default, int):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=-_INT64_MAX if lower is None else int(lower), to_value=_INT64_MAX if upper is None else int(upper)
+            )
+        ]
+    elif isinstance(field.default, float):
+        largest = sys.float_info.max
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-largest if lower is None else float(lower), to_value=largest if upper is None else float(upper)
+            )
+        ]
+    return descriptor
+
+
+def _choices(field: FieldInfo) -> list[str]:
+    values = getattr(field.annotation, "__args__", ())
+    return [f"one of {', '.join(values)}"] if values and all(isinstance(value, str) for value in values) else []

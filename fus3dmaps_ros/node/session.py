@@ -1,0 +1,79 @@
+"""What the node has between configuration and clean-up: models, a map and the thread that feeds it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fus3dmaps_core.encoders.protocols import TextEncoder
+from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.pipeline import Pipeline
+from fus3dmaps_ros.node.worker import FrameWorker
+
+
+class SerialTextEncoder:
+    """A text encoder that several threads may call, one at a time: encoders need not be thread-safe.
+
+    Attributes:
+        space: Name of its trio.
+    """
+
+    def __init__(self, encoder: TextEncoder) -> None:
+        """Guard an encoder."""
+        self._encoder, self.space = encoder, encoder.space
+        self._lock = threading.Lock()
+
+    def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
+        """As the encoder; waits for its turn."""
+        with self._lock:
+            return self._encoder.encode_text(prompts)
+
+
+@dataclass(frozen=True)
+class Session:
+    """Models, map and mapping thread.
+
+    Attributes:
+        pipeline: The map and the models that describe images.
+        worker: The thread that feeds the pipeline.
+        text: The pipeline's text encoder, for any thread.
+    """
+
+    pipeline: Pipeline
+    worker: FrameWorker
+    text: SerialTextEncoder = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Guard the text encoder."""
+        object.__setattr__(self, "text", SerialTextEncoder(self.pipeline.trio.text))
+
+
+class SessionHolder:
+    """Where the parts of the node find the session of the moment."""
+
+    def __init__(self) -> None:
+        """Hold none."""
+        self._session: Session | None = None
+
+    @property
+    def current(self) -> Session | None:
+        """The session, None while the node is unconfigured."""
+        return self._session
+
+    def replace(self, session: Session | None) -> None:
+        """Begin another session, or none."""
+        self._session = session
+
+    def require(self) -> Session:
+        """The session.
+
+        Raises:
+            MapError: There is none.
+        """
+        if self._session is None:
+            raise MapError("the node is unconfigured and has no map; configure it first")
+        return self._session

@@ -1,0 +1,128 @@
+"""Tells the diagnosis what happens in the node, while the node maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Literal
+
+import torch
+from rclpy.node import Node
+
+from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.frame import PosedFrame
+from fus3dmaps_core.health.diagnosis import Diagnosis, MapSizes
+from fus3dmaps_core.health.input_problems import Problem, Stream
+from fus3dmaps_core.health.mapping_problems import MIB, MemoryState
+from fus3dmaps_core.sources.paired import PairedMessages
+from fus3dmaps_core.sources.streams import InputStream, pose_topic
+from fus3dmaps_ros.node.session import Session
+from fus3dmaps_ros.reporting.diagnostics import Diagnostics, publishers_of
+from fus3dmaps_ros.topics.inputs import input_qos
+
+_ROLES: dict[str, Literal["rgb", "depth", "camera_info"]] = {
+    "input.rgb_topic": "rgb",
+    "input.depth_topic": "depth",
+    "input.camera_info_topic": "camera_info",
+    "input.depth_camera_info_topic": "camera_info",
+}
+
+
+class Watch:
+    """From activation to deactivation: follows inputs and frames, and publishes ``/diagnostics``."""
+
+    def __init__(self, node: Node, config: Config, streams: Sequence[InputStream], session: Session) -> None:
+        """Begin to watch.
+
+        Args:
+            node: Owner of the publisher; its clock is what stamps are compared with.
+            config: The configuration in force.
+            streams: The inputs.
+            session: Its map is reported.
+        """
+        self._node = node
+        self._config = config
+        self._session = session
+        self._topics = [stream.topic for stream in streams]
+        self._cameras: dict[str, object] = {}
+        self.diagnosis = Diagnosis(
+            [_stream(stream) for stream in streams],
+            sync_tolerance_s=config.input.sync_tolerance_s,
+            max_wait_s=config.input.max_wait_s,
+            use_sim_time=bool(node.get_parameter("use_sim_time").value),
+        )
+        self._published = Diagnostics(
+            node,
+            self.diagnosis,
+            self._topics,
+            self._sizes,
+            self.memory,
+            hardware_id=config.encoder.device,
+            period_s=config.node.status_period_s,
+        )
+
+    def arrived(self, topic: str, stamp_ns: int) -> None:
+        """A message came on one of the streams."""
+        self.diagnosis.arrived(topic, stamp_ns, self._node.get_clock().now().nanoseconds)
+
+    def offered(self, waiting: int) -> None:
+        """A frame was queued, and so many wait now."""
+        self.diagnosis.offered(waiting)
+
+    def decoded(self, paired: PairedMessages, frame: PosedFrame) -> None:
+        """A keyframe was decoded."""
+        if self._cameras.get(paired.rgb_topic) != paired.intrinsics:
+            self._cameras[paired.rgb_topic] = paired.intrinsics
+            self.diagnosis.camera(paired.rgb_topic, paired.intrinsics)
+        self.diagnosis.frame(
+            frame.T_world_camera,
+            frame.depth_m,
+            depth_topic=paired.depth_topic,
+            encoding=str(getattr(paired.depth, "encoding", None) or paired.depth.format),
+            pose_topic=pose_topic(self._config.input),
+        )
+
+    def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
+        """A frame was dealt with."""
+        self.diagnosis.finished(durations_s, waiting)
+
+    def dropped(self, reason: str, sentence: str, number: int) -> None:
+        """Messages or frames were dropped."""
+        self.diagnosis.dropped(reason, sentence, number)
+
+    def problems(self) -> list[Problem]:
+        """What is wrong now."""
+        offers = {topic: publishers_of(self._node, topic) for topic in self._topics}
+        return self.diagnosis.problems(offers, self.memory())
+
+    def memory(self) -> list[MemoryState]:
+        """How full the map's memory is, and the GPU where the encoders use one."""
+        config = self._config
+        used = sum(self._session.pipeline.semantic_map.nbytes().values())
+        states = [MemoryState(f"map on {config.map.device}", used, round(config.map.memory_budget_mib * MIB))]
+        device = torch.device(config.encoder.device)
+        if device.type == "cuda" and torch.cuda.is_initialized():
+            free, total = torch.cuda.mem_get_info(device)
+            states.append(MemoryState(config.encoder.device, total - free, total))
+        return states
+
+    def close(self) -> None:
+        """Take the topic back."""
+        self._published.close()
+
+    def _sizes(self) -> MapSizes:
+        semantic_map = self._session.pipeline.semantic_map
+        return MapSizes(semantic_map.voxel_count, semantic_map.instance_count, semantic_map.nbytes())
+
+
+def _stream(stream: InputStream) -> Stream:
+    qos = input_qos(stream.qos, 1)
+    role: Literal["rgb", "depth", "camera_info", "pose"] = _ROLES.get(stream.parameter, "pose")
+    return Stream(
+        stream.topic,
+        role,
+        qos.reliability.name,
+        qos.durability.name,
+        topic_parameter=stream.parameter,
+        qos_parameter=f"input.{role}_qos",
+        once=role == "camera_info",
+    )

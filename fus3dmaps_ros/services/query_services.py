@@ -1,0 +1,110 @@
+"""The services that ask: ``~/query_text``, ``~/query_image``, ``~/label_map`` and ``~/list_instances``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rclpy.node import Node
+
+from fus3dmaps_core.answers.labels import DEFAULT_LABEL_LAYER, label_voxels
+from fus3dmaps_core.answers.query import (
+    DEFAULT_LAYER,
+    IMAGE_PROMPT,
+    QueryAnswer,
+    TextQuery,
+    answer_image_query,
+    answer_query,
+    embed_image,
+)
+from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_msgs.srv import LabelMap, ListInstances, QueryImage, QueryText
+from fus3dmaps_ros.node.session import SessionHolder
+from fus3dmaps_ros.node.timed_calls import between_frames
+from fus3dmaps_ros.services.serving import Call, ServiceGroup
+from fus3dmaps_ros.topics import conversions
+from fus3dmaps_ros.topics.outputs import Outputs
+
+
+class QueryServices(ServiceGroup):
+    """Answers questions while mapping goes on; none of them changes the map."""
+
+    def __init__(self, node: Node, sessions: SessionHolder, outputs: Outputs, read: Callable[[], Config]) -> None:
+        """Offer the services.
+
+        Args:
+            node: Owner of the services.
+            sessions: Whose map and encoders answer.
+            outputs: Publishes answers.
+            read: Gives the configuration in force.
+        """
+        super().__init__(node, read)
+        self._sessions = sessions
+        self._outputs = outputs
+        self._offer(QueryText, "query_text", self._query_text)
+        self._offer(QueryImage, "query_image", self._query_image)
+        self._offer(LabelMap, "label_map", self._label_map)
+        self._offer(ListInstances, "list_instances", self._list_instances)
+
+    def _query_text(self, request: Any, response: Any, call: Call) -> str:
+        session = self._sessions.require()
+        query = self._query(request, list(request.prompts))
+        query.check()
+        # Before the map is read: what it holds may be newer than the stamp, never older.
+        header = self._outputs.header()
+        semantic_map, logit_scale = session.pipeline.semantic_map, session.pipeline.trio.logit_scale
+        found = call.in_time(lambda: answer_query(semantic_map, session.text, query, logit_scale))
+        return self._fill(request, response, header, found)
+
+    def _query_image(self, request: Any, response: Any, call: Call) -> str:
+        session = self._sessions.require()
+        query = self._query(request, [IMAGE_PROMPT])
+        query.check()
+        rgb = messages.decode_color(request.image, "image")
+        # By the mapping thread: its encoder need not be thread-safe, and a second copy would not fit the GPU.
+        crop = session.pipeline.trio.crop
+        encoded = session.worker.between_frames(lambda: embed_image(crop, rgb), changes=False)
+        embedding = call.in_time(lambda: between_frames(encoded, call.deadline))
+        header = self._outputs.header()
+        semantic_map, logit_scale = session.pipeline.semantic_map, session.pipeline.trio.logit_scale
+        found = call.in_time(lambda: answer_image_query(semantic_map, embedding, session.text, query, logit_scale))
+        return self._fill(request, response, header, found)
+
+    def _label_map(self, request: Any, response: Any, call: Call) -> str:
+        session = self._sessions.require()
+        labels, layer = list(request.labels), request.layer or DEFAULT_LABEL_LAYER
+        header = self._outputs.header()
+        semantic_map = session.pipeline.semantic_map
+        found = call.in_time(lambda: label_voxels(semantic_map, session.text, labels, layer))
+        response.cloud = conversions.to_label_cloud(header, found)
+        if request.publish:
+            self._outputs.publish_labels(response.cloud)
+        return f"{len(found.points_m)} voxels of layer '{found.layer}' have one of {len(labels)} labels"
+
+    def _list_instances(self, request: Any, response: Any, call: Call) -> str:
+        session = self._sessions.require()
+        min_voxels = request.min_voxels or self._read().query.min_voxels
+        header = self._outputs.header()
+        instances = call.in_time(session.pipeline.semantic_map.instances)
+        response.instances = conversions.to_instances(header, instances, min_voxels)
+        return f"{len(response.instances)} of {len(instances.ids)} instances occupy at least {min_voxels} voxels"
+
+    def _query(self, request: Any, prompts: Sequence[str]) -> TextQuery:
+        """A threshold of 0 leaves nothing out, a top_k of 0 takes ``query.top_k``."""
+        settings = self._read().query
+        return TextQuery(
+            prompts,
+            tuple(request.negative_prompts),
+            request.layer or DEFAULT_LAYER,
+            None if request.threshold == 0.0 else request.threshold,
+            request.top_k or settings.top_k,
+            settings.min_voxels,
+        )
+
+    def _fill(self, request: Any, response: Any, header: Any, found: QueryAnswer) -> str:
+        response.instances = [conversions.to_instance(header, instance) for instance in found.instances]
+        response.similarity = conversions.to_similarity_cloud(header, found)
+        if request.publish:
+            self._outputs.publish_answer(response.similarity, response.instances)
+        return f"{len(found.instances)} instances and {len(found.points_m)} voxels of layer '{found.layer}'"

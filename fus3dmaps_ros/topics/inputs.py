@@ -1,0 +1,154 @@
+"""Subscriptions to what cameras and a localisation publish, paired into frames."""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+from fus3dmaps_core.config.input import QosProfile
+from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.messages.fields import stamp_ns
+from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
+from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_ros.node.drops import DropLog
+from fus3dmaps_ros.topics.tf_poses import TfListener
+
+_TYPES: dict[str, type[Any]] = {
+    "sensor_msgs/msg/Image": Image,
+    "sensor_msgs/msg/CompressedImage": CompressedImage,
+    "sensor_msgs/msg/CameraInfo": CameraInfo,
+    "geometry_msgs/msg/PoseStamped": PoseStamped,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
+    "nav_msgs/msg/Odometry": Odometry,
+}
+_POLICIES: dict[QosProfile, tuple[ReliabilityPolicy, DurabilityPolicy]] = {
+    "sensor_data": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
+    "reliable": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
+    "transient_local": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+    "best_available": (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE),
+}
+# Deep enough to ride out a pause of the interpreter of a third of a second at 30 Hz; the profile's usual 5 are not.
+_IMAGE_DEPTH = 10
+_POSE_DEPTH = 200
+_TF_PERIOD_S = 0.02  # How soon after a transform the image that waits for it goes on.
+
+
+class Inputs:
+    """Subscribes to colour, depth, camera models and poses, and hands complete frames on.
+
+    Attributes:
+        streams: What is subscribed to.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        config: Config,
+        take: Callable[[PairedMessages], None],
+        drops: DropLog,
+        arrived: Callable[[str, int], None] | None = None,
+    ) -> None:
+        """Subscribe.
+
+        Args:
+            node: Owner of the subscriptions.
+            config: Topics, pairing and QoS.
+            take: Gets every complete frame, in stamp order; must not block.
+            drops: Counts what led to no frame.
+            arrived: Is told the topic and the stamp (nanoseconds) of every message.
+
+        Raises:
+            ConfigError: A mounting is not a pose, or TF is wanted and not installed.
+        """
+        self._node = node
+        self._lock = threading.Lock()
+        self._take = take
+        self._drops = drops
+        self._arrived = arrived
+        self._reported: Counter[str] = Counter()
+        self._tf = TfListener(node) if uses_tf(config.input) else None
+        self._pairer = FramePairer(config.input, self._tf)
+        group = MutuallyExclusiveCallbackGroup()
+        self.streams = self._pairer.streams()
+        self._subscriptions = [
+            node.create_subscription(
+                _TYPES[stream.msgtype],
+                stream.topic,
+                self._callback(stream),
+                input_qos(stream.qos, _POSE_DEPTH if stream.parameter in _POSE_PARAMETERS else _IMAGE_DEPTH),
+                callback_group=group,
+            )
+            for stream in self.streams
+        ]
+        self._timer = None
+        if self._tf is not None:
+            # What comes on /tf passes by the pairer. The clock of the machine: that of a simulation may stand still.
+            self._timer = node.create_timer(
+                _TF_PERIOD_S, self._hand_on, callback_group=group, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            )
+
+    def reset(self) -> None:
+        """Forget the messages that wait for their partners."""
+        with self._lock:
+            self._pairer.reset()
+
+    def close(self) -> None:
+        """Unsubscribe and forget what waits. Of no further use then; can be called again."""
+        if self._timer is not None:
+            self._node.destroy_timer(self._timer)
+            self._timer = None
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions = []
+        if self._tf is not None:
+            self._tf.close()
+        self.reset()
+
+    def _callback(self, stream: InputStream) -> Callable[[Any], None]:
+        def received(message: Any) -> None:
+            with self._lock:
+                stream.add(message)
+            if self._arrived is not None:
+                self._arrived(stream.topic, stamp_ns(message))
+            self._hand_on()
+
+        return received
+
+    def _hand_on(self) -> None:
+        """Offer the frames that are complete and report what was dropped."""
+        with self._lock:
+            ready = self._pairer.poll()
+            news = {
+                reason: (count - self._reported[reason], self._pairer.last_drop[reason])
+                for reason, count in self._pairer.drops.items()
+                if count > self._reported[reason]
+            }
+            self._reported = Counter(self._pairer.drops)
+        for reason, (number, sentence) in news.items():
+            self._drops.count(reason, sentence, number)
+        for paired in ready:
+            self._take(paired)
+
+
+_POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
+
+
+def input_qos(profile: QosProfile, depth: int) -> QoSProfile:
+    """The QoS of an input by profile name.
+
+    ``sensor_data`` is best effort and volatile, and matches any publisher; ``reliable`` is volatile, too;
+    ``transient_local`` is reliable and gets what a latched publisher said before; ``best_available`` is the most
+    that all publishers give that are there when it subscribes, and with none there as ``transient_local``.
+    """
+    reliability, durability = _POLICIES[profile]
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
