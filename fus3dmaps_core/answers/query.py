@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from fus3dmaps_core.encoders.protocols import CropEncoder, TextEncoder
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.masks import Masks
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
-from fus3dmaps_core.voxel_map.search import Finding
+from fus3dmaps_core.voxel_map.map_scan import Finding
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from fus3dmaps_core.voxel_map.snapshots import InstanceSnapshot
 
@@ -204,7 +205,7 @@ def _answer(
     negative: NDArray[np.float32],
     logit_scale: float,
 ) -> QueryAnswer:
-    found = semantic_map.search(
+    asked = LayerQuery(
         query.layer,
         positive,
         negative if len(negative) else None,
@@ -213,6 +214,7 @@ def _answer(
         query.top_k,
         query.min_voxels,
     )
+    found = semantic_map.search(asked)
     if not found.voxels:
         raise QueryError(f"layer: '{query.layer}' is empty in this map")
     return QueryAnswer(query.layer, found.points_m, found.similarity, _ranked(query, found))

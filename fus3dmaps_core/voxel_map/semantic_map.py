@@ -1,7 +1,7 @@
-"""The map: one voxel hash, two layers over it, and the sliding window. The only thing that changes.
+"""The map: one voxel hash, two layers over it, and the sliding window.
 
-Every method takes the map's lock for its maths alone, so that queries are answered while mapping goes on. A call that is
-refused has changed nothing.
+A method holds the map's lock only while it computes on the map, so that queries are answered while mapping goes on. A call
+that is refused has changed nothing.
 """
 
 from __future__ import annotations
@@ -9,31 +9,23 @@ from __future__ import annotations
 import math
 import threading
 import time
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from fus3dmaps_core.config.schema import MapConfig
-from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.config.schema import Config, MapConfig
+from fus3dmaps_core.errors import MapError, QueryError
 from fus3dmaps_core.voxel_map.budget import KeyframeBound, MemoryUse
-from fus3dmaps_core.voxel_map.checks import (
-    check_state,
-    float_tensor,
-    index_tensor,
-    unit_rows,
-    voxel_keys,
-    weight_tensor,
-    with_visible,
-)
-from fus3dmaps_core.voxel_map.kernels.protocols import Pairs, Texts
+from fus3dmaps_core.voxel_map.checks import check_state
+from fus3dmaps_core.voxel_map.kernels.protocols import GroupedCounts, Texts
 from fus3dmaps_core.voxel_map.kernels.selection import select_kernels
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.fusion import FusionInputs
-from fus3dmaps_core.voxel_map.layers.similarity import layer_named
-from fus3dmaps_core.voxel_map.search import Finding, Labelling, LayerOf, Question, Survey, unit_texts
+from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
+from fus3dmaps_core.voxel_map.map_scan import Finding, Labelling, MapScan
+from fus3dmaps_core.voxel_map.observations import ObservationReader
 from fus3dmaps_core.voxel_map.snapshots import FusionReport, InstanceSnapshot, VoxelSnapshot
 from fus3dmaps_core.voxel_map.state import MapState
 
@@ -76,8 +68,33 @@ class SemanticMap:
         self._keep_most_evidence = keep_most_evidence
         self._device = torch.device(config.device)
         self._kernels = select_kernels(config.backend, self._device)
+        self._read = ObservationReader(dimension, config.voxel_size_m, self._kernels, self._device)
         self._lock = threading.RLock()
         self._state = self._empty_state()
+
+    @classmethod
+    def from_config(cls, config: Config, dimension: int, variance_ratio: float, space: str = "") -> SemanticMap:
+        """Make an empty map as the configuration says.
+
+        Args:
+            config: Sections ``map`` and ``fusion`` are used.
+            dimension: Embedding width d.
+            variance_ratio: lambda of the encoders, which holds unless ``fusion.variance_ratio`` is set.
+            space: Name of the encoder trio whose embeddings will come.
+
+        Raises:
+            ConfigError: The kernels that the configuration names do not run here.
+        """
+        fusion = config.fusion
+        ratio = fusion.variance_ratio or variance_ratio
+        return cls(dimension, config.map, ratio, fusion.window_radius_m, fusion.keep_most_evidence, space)
+
+    def __repr__(self) -> str:
+        """Say how much the map holds."""
+        return (
+            f"SemanticMap({self.voxel_count:,} voxels of {self.config.voxel_size_m:g} m, {self.dense_voxel_count:,} of them"
+            f" dense, {self.instance_count:,} instances, d = {self.dimension}, encoder '{self.space}')"
+        )
 
     @property
     def window_radius_m(self) -> float:
@@ -104,17 +121,17 @@ class SemanticMap:
             return len(self._state.instances)
 
     def nbytes(self) -> dict[str, int]:
-        """Allocated bytes by part."""
+        """Return the allocated bytes by part."""
         with self._lock:
             return self._state.nbytes()
 
     def memory_use(self, bound: KeyframeBound) -> MemoryUse:
-        """Allocated bytes, and what a keyframe of at most this size can make of them."""
+        """Return the allocated bytes, and what a keyframe of at most this size can make of them."""
         with self._lock:
             return self._state.memory_use(bound)
 
     def reset(self) -> None:
-        """Empty the map; instance ids start at 0 again, and the window is as wide as the map was made with."""
+        """Empty the map. Instance ids start at 0 again, and the window gets its first radius back."""
         with self._lock:
             self._state = self._empty_state()
             self._radius_m = self._given_radius_m
@@ -139,26 +156,14 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = self._unit_rows("embeddings", embeddings)
-        patch_index = index_tensor("patches", patches, len(points_m), len(embeddings), self._device)
-        patch_weights = weight_tensor(weights, len(embeddings), self._device)
-        if colors.shape != (len(points_m), 3) or colors.dtype != np.uint8:
-            raise MapError(f"colors: must be ({len(points_m)}, 3) uint8, got {colors.shape} {colors.dtype}")
-        if not len(keys):
+        seen = self._read.dense(points_m, patches, embeddings, weights, colors)
+        if not len(seen.keys):
             return
-        keys, voxels, counts = self._kernels.distinct(keys)
-        color_sums = torch.zeros((len(keys), 3), dtype=torch.int64, device=self._device)
-        color_sums.index_add_(0, voxels, torch.from_numpy(colors.astype(np.int64)).to(self._device))
-        mean_colors = ((2 * color_sums + counts[:, None]) // (2 * counts[:, None])).to(torch.uint8)
-        if not bool((patch_weights > 0).all()):
-            useful = patch_weights.index_select(0, patch_index) > 0
-            voxels, patch_index = voxels.masked_select(useful), patch_index.masked_select(useful)
-        observations = self._kernels.count_pairs(voxels, patch_index, len(keys), len(unit))
         with self._lock:
-            slots = self._state.slots(keys)
-            self._state.colors[slots] = mean_colors
-            self._state.instances.touch(self._state.dense.accumulate(slots, keys, observations, unit, patch_weights))
+            slots = self._state.slots(seen.keys)
+            self._state.colors[slots] = seen.colors
+            changed = self._state.dense.accumulate(slots, seen.keys, seen.patches, seen.embeddings, seen.weights)
+            self._state.instances.mark_changed(changed)
 
     def integrate_proposals(
         self,
@@ -187,21 +192,15 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        unit = self._unit_rows("embeddings", embeddings)
-        proposal_index = index_tensor("proposals", proposals, len(points_m), len(embeddings), self._device)
-        visible_keys = None
-        if self.config.association == "visible_iou":
-            visible_keys = with_visible(keys, visible_points_m, self.config.voxel_size_m, self._kernels, self._device)
-        if not len(keys):
+        needs_visible = self.config.association == "visible_iou"
+        seen = self._read.proposals(points_m, proposals, embeddings, visible_points_m, needs_visible)
+        if not len(seen.keys):
             return np.full(len(embeddings), -1, np.int64)
-        keys, voxels, _ = self._kernels.distinct(keys)
-        pairs = self._kernels.count_pairs(proposal_index, voxels, len(unit), len(keys))
         with self._lock:
-            self._state.instances.check_room(len(unit))
-            slots = self._state.slots(keys)
-            groups = Pairs(pairs.offsets, slots.index_select(0, pairs.partners), pairs.counts)
-            ids = self._state.integrate(slots, groups, unit, visible_keys)
+            self._state.instances.check_room(len(embeddings))
+            slots = self._state.slots(seen.keys)
+            groups = GroupedCounts(seen.voxels.offsets, slots.index_select(0, seen.voxels.partners), seen.voxels.counts)
+            ids = self._state.associate(slots, groups, seen.embeddings, seen.visible_keys)
         return ids.cpu().numpy()
 
     def set_window_radius(self, radius_m: float) -> None:
@@ -232,7 +231,7 @@ class SemanticMap:
         Raises:
             MapError: The position is not three finite numbers.
         """
-        center = float_tensor("center_m", center_m, (3,), self._device, torch.float64)
+        center = self._read.position("center_m", center_m)
         if self._given_radius_m <= 0:
             return 0
         with self._lock:
@@ -240,7 +239,7 @@ class SemanticMap:
             keys = self._state.hash.keys(slots)
             gone = self._kernels.farther(keys, self.config.voxel_size_m, center, self._radius_m)
             if len(gone):
-                self._state.instances.touch(slots.index_select(0, gone))
+                self._state.instances.mark_changed(slots.index_select(0, gone))
                 self._state.dense.drop(rows.index_select(0, gone))
             return len(gone)
 
@@ -264,15 +263,15 @@ class SemanticMap:
         with self._lock:
             rows = self._state.dense.least_observed(count)
             if len(rows):
-                self._state.instances.touch(self._state.dense.slots(rows))
+                self._state.instances.mark_changed(self._state.dense.slots(rows))
                 self._state.dense.drop(rows)
             return len(rows)
 
     def release_unused(self) -> int:
-        """Give memory back that no dense embedding is in, in whole blocks; what the map holds and answers is the same.
+        """Free memory that holds no dense embedding, in whole blocks. What the map holds and answers stays the same.
 
         Returns:
-            Bytes by which the allocated ones became fewer.
+            Bytes that were freed.
         """
         with self._lock:
             before = self._state.dense.nbytes
@@ -294,8 +293,7 @@ class SemanticMap:
         Raises:
             MapError: A shape, dtype, range or value is wrong.
         """
-        keys = voxel_keys(points_m, self.config.voxel_size_m, self._kernels, self._device)
-        keys, _, _ = self._kernels.distinct(keys)
+        keys, _, _ = self._kernels.distinct(self._read.voxel_keys("points_m", points_m))
         with self._lock:
             slots = self._state.hash.find(keys)
             slots = slots.masked_select(slots >= 0)
@@ -321,7 +319,7 @@ class SemanticMap:
             return FusionReport(len(state.instances), updated, recomputed, len(state.hash), duration_s)
 
     def voxels(self) -> VoxelSnapshot:
-        """A copy of all voxels."""
+        """Return a copy of all voxels."""
         with self._lock:
             state = self._state
             slots = state.hash.live()
@@ -335,46 +333,29 @@ class SemanticMap:
             )
 
     def instances(self) -> InstanceSnapshot:
-        """A copy of all instances alive."""
+        """Return a copy of all instances alive."""
         with self._lock:
-            return Survey(self._state, self._kernels, self.config.voxel_size_m).instances()
+            return self._scan().instances()
 
-    def search(
-        self,
-        layer: str,
-        prompts: NDArray[np.floating],
-        negatives: NDArray[np.floating] | None = None,
-        logit_scale: float = 1.0,
-        threshold: float | None = None,
-        top_k: int = 5,
-        min_voxels: int = 1,
-    ) -> Finding:
+    def search(self, query: LayerQuery) -> Finding:
         """Compare a layer with texts [sec: Implementation Details]. The map is not changed, and does not change meanwhile.
 
-        Without a window, fusion is that of the map as it is. Memory beside the answer does not follow the map's size.
-
-        Args:
-            layer: One of LAYERS.
-            prompts: (p, d) text embeddings, any length but 0.
-            negatives: (q, d) embeddings of what is not meant; with them a score is a probability, without them a cosine.
-            logit_scale: Factor of the cosines in that probability.
-            threshold: Voxels with a lower score are left out; None leaves none out.
-            top_k: At most this many instances per prompt.
-            min_voxels: Instances that occupy fewer voxels are not ranked.
+        Without a window, fusion is that of the map as it is. Memory beside the answer does not grow with the map.
 
         Raises:
             QueryError: The layer is unknown, or there is no prompt.
             MapError: The texts have the wrong shape or are not finite.
         """
-        given = {"prompts": prompts} | ({} if negatives is None else {"negatives": negatives})
-        vectors = unit_texts(layer, given, self._unit_rows)
-        texts = Texts(torch.cat(vectors), len(vectors[0]), logit_scale)
+        _check_asked(query.layer, "prompt", query.prompts)
+        vectors = [self._read.unit_rows("prompts", query.prompts)]
+        if query.negatives is not None:
+            vectors.append(self._read.unit_rows("negatives", query.negatives))
+        texts = Texts(torch.cat(vectors), len(query.prompts), query.logit_scale)
         with self._lock:
-            survey = Survey(self._state, self._kernels, self.config.voxel_size_m)
-            return survey.search(self._layer(layer), Question(texts, threshold, top_k, min_voxels))
+            return self._scan().search(query, texts)
 
     def label(self, layer: str, texts: NDArray[np.floating]) -> Labelling:
-        """Which of some texts fits each voxel of a layer best, and each instance; otherwise as :meth:`search`.
+        """Find which of some texts fits each voxel of a layer best, and each instance; otherwise like :meth:`search`.
 
         Args:
             layer: One of LAYERS.
@@ -384,12 +365,13 @@ class SemanticMap:
             QueryError: The layer is unknown, or there is no text.
             MapError: The texts have the wrong shape or are not finite.
         """
-        (vectors,) = unit_texts(layer, {"texts": texts}, self._unit_rows)
+        _check_asked(layer, "text", texts)
+        vectors = self._read.unit_rows("texts", texts)
         with self._lock:
-            return Survey(self._state, self._kernels, self.config.voxel_size_m).label(self._layer(layer), vectors)
+            return self._scan().label(layer, vectors)
 
     def export_state(self) -> dict[str, NDArray[Any]]:
-        """Everything the map holds, as arrays by name: what a map file stores and what :meth:`import_state` reads.
+        """Return everything the map holds, as arrays by name: what a map file stores and :meth:`import_state` reads.
 
         Returns:
             What :meth:`MapState.export` says.
@@ -409,14 +391,18 @@ class SemanticMap:
         with self._lock:
             self._state = fresh
 
-    def _unit_rows(self, name: str, embeddings: NDArray[np.floating]) -> Tensor:
-        return unit_rows(name, embeddings, self.dimension, self._kernels, self._device)
-
-    def _layer(self, name: str) -> LayerOf:
-        return partial(layer_named, name, self._fusion_inputs(), self._state.fused)
+    def _scan(self) -> MapScan:
+        return MapScan(self._state, self._fusion_inputs(), self.config.voxel_size_m)
 
     def _empty_state(self) -> MapState:
         return MapState(self.dimension, self.config, self._given_radius_m > 0, self._kernels, self._keep_most_evidence)
 
     def _fusion_inputs(self) -> FusionInputs:
         return FusionInputs(self._kernels, self._state.dense, self._state.instances, self.variance_ratio)
+
+
+def _check_asked(layer: str, what: str, texts: NDArray[np.floating]) -> None:
+    if layer not in LAYERS:
+        raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
+    if texts.shape[:1] == (0,):
+        raise QueryError(f"{what}s: at least one {what} is needed")

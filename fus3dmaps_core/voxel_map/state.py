@@ -12,7 +12,7 @@ from torch import Tensor
 from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.voxel_map.budget import KeyframeBound, MemoryUse
 from fus3dmaps_core.voxel_map.kernels.keys import pack
-from fus3dmaps_core.voxel_map.kernels.protocols import Kernels, Pairs
+from fus3dmaps_core.voxel_map.kernels.protocols import GroupedCounts, Kernels
 from fus3dmaps_core.voxel_map.layers.dense import DenseLayer
 from fus3dmaps_core.voxel_map.layers.fused_instances import FusedInstances
 from fus3dmaps_core.voxel_map.layers.instances import InstanceLayer
@@ -22,9 +22,6 @@ from fus3dmaps_core.voxel_map.rows.rounding import seeds_of
 from fus3dmaps_core.voxel_map.voxel_hash import VoxelHash
 
 _UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour of their own.
-_CELL_BYTES, _KEY_BYTES, _LEAST_ROWS = 12, 8, 1024  # Of the hash, and what a column has at least.
-_INSTANCE_BYTES = 50  # Of an instance beside its embeddings.
-_ADDRESS_BYTES, _LEAST_ADDRESSES = 8, 16  # Of the blocks of a pool.
 
 
 class MapState:
@@ -62,7 +59,7 @@ class MapState:
         self.instances.reserve(count)
         return slots
 
-    def integrate(self, slots: Tensor, proposals: Pairs, embeddings: Tensor, visible_keys: Tensor | None) -> Tensor:
+    def associate(self, slots: Tensor, proposals: GroupedCounts, embeddings: Tensor, visible_keys: Tensor | None) -> Tensor:
         """Give a keyframe's proposals to instances, then merge instances that have grown into one another if that is wanted.
 
         Args:
@@ -79,8 +76,8 @@ class MapState:
         if visible_keys is not None:
             visible = self.hash.find(visible_keys)
             visible = visible.masked_select(visible >= 0)
-        ids, created = self.instances.integrate(proposals, embeddings, visible)
-        self.fused.admit(created)
+        ids, created = self.instances.associate(proposals, embeddings, visible)
+        self.fused.make_room(created)
         if self._merge_rule[0] > 0:
             for gone, into in merge_overlapping(self._kernels, self.instances, self.fused, slots, *self._merge_rule):
                 ids.masked_fill_(ids == gone, into)
@@ -104,46 +101,26 @@ class MapState:
         }
 
     def memory_use(self, bound: KeyframeBound) -> MemoryUse:
-        """Allocated bytes, and what a keyframe of at most this size can make of them."""
+        """Return the allocated bytes, and what a keyframe of at most this size can make of them."""
         allocated, pool = sum(self.nbytes().values()), self.dense.pool
-        lasting = allocated - (self.dense.nbytes - self.dense.link_nbytes)
-        return MemoryUse(
-            allocated,
-            lasting,
-            lasting + self._voxel_growth(bound.voxels) + self._instance_growth(bound.instances),
-            len(self.dense),
-            bound.dense_voxels,
-            len(pool.blocks) * pool.block_rows,
-            pool.block_rows,
-            self.dense.block_nbytes,
+        slots = self.hash.high_water_after(bound.voxels)
+        lasting_next = (
+            self.hash.nbytes_after(bound.voxels)
+            + self.dense.link_nbytes_after(slots)
+            + self.colors.nbytes_after(slots)
+            + self.instances.nbytes_after(slots, bound.instances)
+            + self.fused.nbytes_after(self.instances.pool.high_water_after(bound.instances))
         )
-
-    def _voxel_growth(self, count: int) -> int:
-        """Bytes by which the hash and the columns of slots grow for so many new voxels, at most."""
-        held = self.instances.held()
-        capacity, needed = len(held), self.hash.high_water + count
-        wider = 0
-        if needed > capacity:
-            doubled = max(2 * capacity, _LEAST_ROWS)
-            # The layers grow one after the other: what just sufficed for the first is doubled for the second.
-            wider = (doubled if needed <= doubled else 2 * needed) - capacity
-        colors, link, hypotheses = 3, 4, 8 * held.shape[1]
-        # A table has a power of two cells; the list of free slots that is counted with it is shorter.
-        cells = before = 1 << (((self.hash.nbytes - _KEY_BYTES * capacity) // _CELL_BYTES).bit_length() - 1)
-        if 2 * (len(self.hash) + count) > cells:
-            while 4 * (len(self.hash) + count) > cells:
-                cells *= 2
-        return wider * (_KEY_BYTES + colors + link + hypotheses) + (cells - before) * _CELL_BYTES
-
-    def _instance_growth(self, count: int) -> int:
-        """Bytes by which what is known of instances grows for so many new ones, at most."""
-        pool = self.instances.pool
-        rows = max(pool.high_water, len(pool) + count)
-        blocks = -(-rows // pool.block_rows) - len(pool.blocks)
-        pools = 2 if self._windowed else 3  # Their own embeddings and the stored fused ones; without a window the current.
-        row_bytes = pools * pool.dimension * pool.dtype.itemsize
-        addresses = pools * _ADDRESS_BYTES * (blocks + max(len(pool.blocks), _LEAST_ADDRESSES))
-        return blocks * pool.block_rows * row_bytes + max(rows, _LEAST_ROWS) * _INSTANCE_BYTES + addresses
+        return MemoryUse(
+            allocated=allocated,
+            lasting=allocated - (self.dense.nbytes - self.dense.link_nbytes),
+            lasting_next=lasting_next,
+            dense_voxels=len(self.dense),
+            new_dense_voxels=bound.dense_voxels,
+            dense_rows=len(pool.blocks) * pool.block_rows,
+            block_rows=pool.block_rows,
+            block_bytes=self.dense.block_nbytes,
+        )
 
     def export(self) -> dict[str, NDArray[Any]]:
         """Everything as arrays by name, voxels in the order of their slots.
@@ -202,7 +179,7 @@ class MapState:
     def _fill_dense(self, tensors: dict[str, Tensor], slots: Tensor, keys: Tensor) -> None:
         place, weights = tensors["dense_slot"].to(torch.int64), tensors["dense_weight"].to(torch.float32)
         stored = tensors["dense_embedding"]
-        rows = self.dense.admit(slots[place], weights)
+        rows = self.dense.add(slots[place], weights)
         if stored.dtype == self.dense.pool.dtype:
             self.dense.pool.write_stored(rows, stored, tensors.get("dense_scale"))
             return

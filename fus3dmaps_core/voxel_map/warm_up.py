@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from fus3dmaps_core.config.schema import MapConfig
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
@@ -30,7 +31,7 @@ def warm_up(dimension: int, config: MapConfig) -> None:
         rehearsal.integrate_proposals(points_m, index, embeddings)
         for layer in LAYERS:
             for prompts in (embeddings, embeddings[:1]):
-                rehearsal.search(layer, prompts, embeddings)
+                rehearsal.search(LayerQuery(layer, prompts, embeddings))
         rehearsal.fuse()
         rehearsal.prune_window(points_m[0])
         rehearsal.remove_voxels(points_m)

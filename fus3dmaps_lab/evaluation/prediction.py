@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import MapError
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 Rule = Literal["global", "chunked"]
@@ -45,7 +46,7 @@ def layer_cosines(
     columns: NDArray[np.float32] | None = None
     centers_m = np.empty((0, 3), np.float32)
     for number, text in enumerate(text_vectors):
-        found = semantic_map.search(layer, text[None], top_k=1)
+        found = semantic_map.search(LayerQuery(layer, text[None], top_k=1))
         if columns is None:
             centers_m = found.points_m
             columns = np.empty((len(text_vectors), len(centers_m)), np.float32)

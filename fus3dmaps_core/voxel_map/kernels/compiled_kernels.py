@@ -28,17 +28,17 @@ from fus3dmaps_core.voxel_map.kernels.protocols import (
     Association,
     EmbeddedLayer,
     Extents,
-    Fusable,
+    FusionRows,
+    GroupedCounts,
     HashTable,
     Hypotheses,
     InheritedLayer,
-    Pairs,
     ScoredVoxels,
     ScoreSums,
     SlotBlock,
 )
 from fus3dmaps_core.voxel_map.kernels.workers import Lanes, Workers, cuts
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 from fus3dmaps_core.voxel_map.rows.scratch import Scratch
 
 _LANES = 2  # Fixed, so that sums over many voxels do not depend on the number of threads; each lane has sums of its own.
@@ -79,13 +79,13 @@ class CompiledKernels:
         found = numba_points.distinct(keys.numpy(), unique, inverse, counts)
         return torch.from_numpy(unique[:found]), torch.from_numpy(inverse), torch.from_numpy(counts[:found])
 
-    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> Pairs:
+    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
         """As the protocol says: partners of a group in the order of first appearance."""
         offsets = np.empty(groups + 1, np.int64)
         found, counts = np.empty(len(first), np.int64), np.empty(len(first), np.int64)
         numba_points.count_pairs(first.numpy(), second.numpy(), partners, offsets, found, counts)
         end = int(offsets[-1])
-        return Pairs(torch.from_numpy(offsets), torch.from_numpy(found[:end]), torch.from_numpy(counts[:end]))
+        return GroupedCounts(torch.from_numpy(offsets), torch.from_numpy(found[:end]), torch.from_numpy(counts[:end]))
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
         """As the protocol says."""
@@ -97,9 +97,9 @@ class CompiledKernels:
         """As the protocol says."""
         numba_points.place(table.keys.numpy(), table.slots.numpy(), _shift(table), EMPTY, keys.numpy(), slots.numpy())
 
-    def bury(self, table: HashTable, keys: Tensor) -> None:
+    def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
         """As the protocol says."""
-        numba_points.bury(table.keys.numpy(), _shift(table), DELETED, keys.numpy())
+        numba_points.mark_deleted(table.keys.numpy(), _shift(table), DELETED, keys.numpy())
 
     def merge_means(
         self,
@@ -108,7 +108,7 @@ class CompiledKernels:
         old: Tensor,
         new: Tensor,
         seeds: Tensor,
-        groups: Pairs,
+        groups: GroupedCounts,
         amounts: Tensor,
         embeddings: Tensor,
     ) -> None:
@@ -117,10 +117,10 @@ class CompiledKernels:
         pooled = (*stored(pool), pool.scales[:].numpy())
         self._share(numba_rows.merge_means, len(rows), pool.dimension, *pooled, *(each.numpy() for each in arrays))
 
-    def integrate(
+    def associate(
         self,
         hypotheses: Hypotheses,
-        proposals: Pairs,
+        proposals: GroupedCounts,
         spare_rows: Tensor,
         next_id: int,
         iou_threshold: float,
@@ -129,7 +129,7 @@ class CompiledKernels:
         """As the protocol says."""
         matched, ids = (np.empty(len(proposals.offsets) - 1, np.int64) for _ in range(2))
         dead = np.empty(len(hypotheses.id_of_row), np.int64)
-        created, died = numba_instances.integrate(
+        created, died = numba_instances.associate(
             proposals.offsets.numpy(),
             proposals.partners.numpy(),
             proposals.counts.numpy(),
@@ -256,7 +256,7 @@ class CompiledKernels:
         self._share(numba_cosines.cosines, len(rows), pool.dimension, *stored(pool), *arrays)
         return torch.from_numpy(found)
 
-    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
+    def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """As the protocol says."""
         pool, count = voxels.pool, len(rows)
         place = np.full(own.high_water, -1, np.int32)

@@ -55,7 +55,7 @@ def _best_match(
 
 
 @njit(**_OPTIONS)
-def integrate(
+def associate(
     offsets: NDArray[np.int64],
     slots: NDArray[np.int64],
     counts: NDArray[np.int64],

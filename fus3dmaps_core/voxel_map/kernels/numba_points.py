@@ -180,7 +180,7 @@ def place(
 
 
 @njit(**_OPTIONS)
-def bury(table_keys: NDArray[np.int64], shift: int, deleted: int, keys: NDArray[np.int64]) -> None:
+def mark_deleted(table_keys: NDArray[np.int64], shift: int, deleted: int, keys: NDArray[np.int64]) -> None:
     """Mark the cells of keys that are in the table as deleted: probing goes on past them."""
     mask = len(table_keys) - 1
     for i in range(len(keys)):

@@ -17,7 +17,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 TAGS = {torch.float32: np.float32(0), torch.float16: np.uint16(0), torch.int8: np.int8(0)}
 """Tag of each storage type; numba has no halves on CPUs, so they go by the type of their bits."""

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from torch import Tensor
 
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 EMPTY, DELETED = -1, -2
 """Contents of cells of a hash table without a key: probing ends at an empty one and goes on past a deleted one."""
@@ -34,7 +34,7 @@ class HashTable:
 
 
 @dataclass(frozen=True)
-class Pairs:
+class GroupedCounts:
     """A sparse matrix of counts, by rows: what in which group, how often.
 
     Attributes:
@@ -183,7 +183,7 @@ class ScoredVoxels:
 
 
 @dataclass(frozen=True)
-class Fusable:
+class FusionRows:
     """What the fusion of instances with their voxels reads, beside their own embeddings.
 
     Attributes:
@@ -240,7 +240,7 @@ class Kernels(Protocol):
         """Distinct keys in an order that the input alone decides, the place of each input among them, and counts: int64."""
         ...
 
-    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> Pairs:
+    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
         """Count equal (first, second) pairs, (n,) int64 in [0, groups) and [0, partners), grouped by first."""
         ...
 
@@ -252,7 +252,7 @@ class Kernels(Protocol):
         """Put distinct keys that the table lacks into it, which must have room."""
         ...
 
-    def bury(self, table: HashTable, keys: Tensor) -> None:
+    def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
         """Mark distinct keys that the table has as deleted."""
         ...
 
@@ -263,7 +263,7 @@ class Kernels(Protocol):
         old: Tensor,
         new: Tensor,
         seeds: Tensor,
-        groups: Pairs,
+        groups: GroupedCounts,
         amounts: Tensor,
         embeddings: Tensor,
     ) -> None:
@@ -281,10 +281,10 @@ class Kernels(Protocol):
         """
         ...
 
-    def integrate(
+    def associate(
         self,
         hypotheses: Hypotheses,
-        proposals: Pairs,
+        proposals: GroupedCounts,
         spare_rows: Tensor,
         next_id: int,
         iou_threshold: float,
@@ -380,7 +380,7 @@ class Kernels(Protocol):
         """Cosines of the rows with unit vectors (p, d): (n, p) float32."""
         ...
 
-    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
+    def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """Fuse instances: target[row] <- (sum of w f over the voxels that hold it + amount own[row]) / evidence.
 
         The evidence is the sum of w over these voxels, plus the amount. Where it is 0, own[row] is what is written.

@@ -9,7 +9,7 @@ from fus3dmaps_core.voxel_map.kernels.protocols import Texts
 
 
 def scores_of(cosines: Tensor, texts: Texts) -> Tensor:
-    """Scores (n, p) float32 of cosines (n, p + q) with prompts and negatives, as :class:`Texts` defines them."""
+    """Convert cosines (n, p + q) with prompts and negatives to scores (n, p) float32, as :class:`Texts` defines them."""
     positive, negative = cosines[:, : texts.prompts], cosines[:, texts.prompts :]
     if not negative.shape[1]:
         return positive

@@ -17,17 +17,17 @@ from fus3dmaps_core.voxel_map.kernels.protocols import (
     Association,
     EmbeddedLayer,
     Extents,
-    Fusable,
+    FusionRows,
+    GroupedCounts,
     HashTable,
     Hypotheses,
     InheritedLayer,
-    Pairs,
     ScoredVoxels,
     ScoreSums,
     SlotBlock,
 )
 from fus3dmaps_core.voxel_map.kernels.scores import scores_of
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 _COUNT_UNIT = 2**32  # Orders by count first, then by id, in one integer.
 _READ_ROWS = 2048  # Rows that are decoded at once, so that memory stays bounded.
@@ -61,14 +61,14 @@ class TorchKernels:
         unique, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
         return unique, inverse, counts
 
-    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> Pairs:
+    def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
         """As the protocol says: partners of a group in ascending order."""
         pairs, counts = torch.unique(first * partners + second, return_counts=True)
         offsets = torch.zeros(groups + 1, dtype=torch.int64, device=first.device)
         if len(pairs):
             offsets[1:] = torch.cumsum(torch.bincount(pairs // partners, minlength=groups), 0)
             pairs = pairs % partners
-        return Pairs(offsets, pairs, counts)
+        return GroupedCounts(offsets, pairs, counts)
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
         """As the protocol says."""
@@ -94,7 +94,7 @@ class TorchKernels:
             table.slots[cells[won]] = slots[won].to(torch.int32)
             keys, slots, cells = keys[~won], slots[~won], (cells[~won] + 1) & (len(table.keys) - 1)
 
-    def bury(self, table: HashTable, keys: Tensor) -> None:
+    def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
         """As the protocol says."""
         cells = home(keys, len(table.keys))
         while len(keys):
@@ -109,7 +109,7 @@ class TorchKernels:
         old: Tensor,
         new: Tensor,
         seeds: Tensor,
-        groups: Pairs,
+        groups: GroupedCounts,
         amounts: Tensor,
         embeddings: Tensor,
     ) -> None:
@@ -120,10 +120,10 @@ class TorchKernels:
         scales = torch.where(known, pool.scales[rows], 0.0) if pool.dtype == torch.int8 else None
         pool.write(rows, means.mul_((old / new)[:, None]).add_(sums.div_(new[:, None])), seeds, scales)
 
-    def integrate(
+    def associate(
         self,
         hypotheses: Hypotheses,
-        proposals: Pairs,
+        proposals: GroupedCounts,
         spare_rows: Tensor,
         next_id: int,
         iou_threshold: float,
@@ -255,7 +255,7 @@ class TorchKernels:
             found[part] = normalize(pool.read(rows[part]), dim=1) @ texts.T
         return found
 
-    def fuse(self, voxels: Fusable, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
+    def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """As the protocol says."""
         place = torch.full((own.high_water,), -1, dtype=torch.int64, device=rows.device)
         place[rows] = torch.arange(len(rows), device=rows.device)
@@ -308,7 +308,7 @@ def _fused_means(layer: EmbeddedLayer, own: RowPool, rows: Tensor, top_rows: Ten
     return fused
 
 
-def _weighted_sums(voxels: Fusable, place_of_instance: Tensor, places: int) -> tuple[Tensor, Tensor]:
+def _weighted_sums(voxels: FusionRows, place_of_instance: Tensor, places: int) -> tuple[Tensor, Tensor]:
     """Sums over instances' voxels of w f, (places, d) float64, and of w, (places,) float64."""
     pool, slot_of_row = voxels.pool, voxels.slot_of_row
     sums = torch.zeros((places, pool.dimension), dtype=torch.float64, device=slot_of_row.device)

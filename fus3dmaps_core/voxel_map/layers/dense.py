@@ -5,14 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from fus3dmaps_core.voxel_map.kernels.protocols import Kernels, Pairs
+from fus3dmaps_core.voxel_map.kernels.protocols import GroupedCounts, Kernels
 from fus3dmaps_core.voxel_map.rows.columns import Column
 from fus3dmaps_core.voxel_map.rows.rounding import seeds_of
-from fus3dmaps_core.voxel_map.rows.rows import RowPool, shortened
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool, shortened
 
 
 class DenseLayer:
-    """Weights and mean embeddings in pooled rows; a voxel has a row only while it has dense evidence."""
+    """Weights and mean embeddings in pooled rows. A voxel has a row only while it has dense evidence."""
 
     def __init__(self, dimension: int, dtype: torch.dtype, kernels: Kernels, device: torch.device) -> None:
         """Start empty; means are stored in ``dtype`` and computed in float32."""
@@ -24,7 +24,7 @@ class DenseLayer:
         self._weight_of_row = Column(torch.float32, 0.0, device)
 
     def __len__(self) -> int:
-        """Number of voxels with a dense embedding."""
+        """Return the number of voxels with a dense embedding."""
         return len(self.pool)
 
     def reserve(self, slots: int) -> None:
@@ -32,38 +32,40 @@ class DenseLayer:
         self._row_of_slot.reserve(slots)
 
     def rows(self, slots: Tensor | slice) -> Tensor:
-        """Row of each slot, -1 where a voxel has no dense embedding: (n,) int64."""
+        """Look up the row of each slot, -1 where a voxel has no dense embedding: (n,) int64."""
         return self._row_of_slot[slots].to(torch.int64)
 
     def row_of_slot(self, slots: slice) -> Tensor:
-        """Row of each slot, -1 where a voxel has no dense embedding: (n,) int32, not a copy."""
+        """Return the row of each slot, -1 where a voxel has no dense embedding: (n,) int32, a view."""
         return self._row_of_slot[slots]
 
     def slots(self, rows: Tensor) -> Tensor:
-        """Slot of each row, -1 for a free one: (n,) int64."""
+        """Look up the slot of each row, -1 for a free one: (n,) int64."""
         return self._slot_of_row[rows].to(torch.int64)
 
     def slot_of_row(self) -> Tensor:
-        """Slot of every row ever given, -1 for a free one: (rows,) int32, not a copy."""
+        """Return the slot of every row, -1 for a free one: (rows,) int32, a view."""
         return self._slot_of_row[: self.pool.high_water]
 
     def weight_of_row(self) -> Tensor:
-        """Weight w^D of every row ever given: (rows,) float32, not a copy."""
+        """Return the weight w^D of every row: (rows,) float32, a view."""
         return self._weight_of_row[: self.pool.high_water]
 
     def weights(self, rows: Tensor) -> Tensor:
-        """Weight w^D of each row, 0 for row -1: (n,) float32."""
+        """Look up the weight w^D of each row, 0 for row -1: (n,) float32."""
         if not self.pool.high_water:
             return torch.zeros(len(rows), device=self._device)
         return torch.where(rows >= 0, self._weight_of_row[rows.clamp(min=0)], 0.0)
 
     def live(self) -> tuple[Tensor, Tensor]:
-        """Rows in use and their slots, in the order of rows: two (n,) int64."""
+        """Return the rows in use and their slots, in the order of rows: two (n,) int64."""
         slots = self.slot_of_row()
         rows = torch.nonzero(slots >= 0).squeeze(1)
         return rows, slots.index_select(0, rows).to(torch.int64)
 
-    def accumulate(self, slots: Tensor, keys: Tensor, observations: Pairs, embeddings: Tensor, weights: Tensor) -> Tensor:
+    def accumulate(
+        self, slots: Tensor, keys: Tensor, observations: GroupedCounts, embeddings: Tensor, weights: Tensor
+    ) -> Tensor:
         """Add the observations of one keyframe [eq. dense_agg].
 
         Observations are counted per (voxel, patch) pair first and then multiplied, so that no point-by-d matrix exists.
@@ -83,7 +85,7 @@ class DenseLayer:
         if len(hit) < len(slots):  # A voxel all of whose points had no weight is left as it is.
             slots, keys, lengths = (each.index_select(0, hit) for each in (slots, keys, lengths))
             offsets = torch.cat([observations.offsets[:1], observations.offsets[1:].index_select(0, hit)])
-            observations = Pairs(offsets, observations.partners, observations.counts)
+            observations = GroupedCounts(offsets, observations.partners, observations.counts)
         if not len(slots):
             return slots
         added = observations.counts.to(torch.float32) * weights.index_select(0, observations.partners)
@@ -103,7 +105,7 @@ class DenseLayer:
         self.pool.free(rows)
 
     def least_observed(self, count: int) -> Tensor:
-        """Rows of the ``count`` lowest weights, of equal ones those of the lowest slots: (count,) int64.
+        """Find the rows of the ``count`` lowest weights, of equal ones those of the lowest slots: (count,) int64.
 
         Args:
             count: At most as many as there are voxels with a dense embedding.
@@ -121,7 +123,7 @@ class DenseLayer:
         return torch.cat([below, level_rows.index_select(0, oldest)])
 
     def compact(self) -> None:
-        """Move embeddings together and give back the blocks that are then empty; nothing that is known changes."""
+        """Move embeddings together and free the blocks that are then empty. What the layer knows stays the same."""
         count = len(self.pool)
         if self.pool.spare_blocks:
             used = self.slot_of_row() >= 0
@@ -136,24 +138,26 @@ class DenseLayer:
             self._weight_of_row = shortened(self._weight_of_row, count, 0.0)
             self.pool.truncate(count)
 
-    def admit(self, slots: Tensor, weights: Tensor) -> Tensor:
-        """Give slots without a dense embedding a row of the weights (n,): (n,) int64 rows, whose means are undefined."""
+    def add(self, slots: Tensor, weights: Tensor) -> Tensor:
+        """Give slots without a dense embedding rows with the weights (n,): (n,) int64 rows, whose means are undefined."""
         rows = self._rows_for(slots)
         self._weight_of_row[rows] = weights
         return rows
 
     @property
     def block_nbytes(self) -> int:
-        """Most bytes that the embeddings of one block take, with columns that have just doubled."""
-        scale = 4 if self.pool.dtype == torch.int8 else 0
-        columns = 2 * (4 + 4 + 4 + scale)  # Slot, weight and, if it is free, the number of a row.
-        addresses = 16 * 8  # There is room for as many at least.
-        return self.pool.block_rows * (self.pool.dimension * self.pool.dtype.itemsize + columns) + addresses
+        """Most bytes that one more block of embeddings takes, with columns that have just doubled."""
+        columns = 2 * (self._slot_of_row.row_nbytes + self._weight_of_row.row_nbytes)
+        return self.pool.block_nbytes + self.pool.block_rows * columns
 
     @property
     def link_nbytes(self) -> int:
         """Allocated bytes of what every voxel has, with a dense embedding or without."""
         return self._row_of_slot.nbytes
+
+    def link_nbytes_after(self, slots: int) -> int:
+        """Return the most bytes of that once slots 0 .. slots - 1 are addressable."""
+        return self._row_of_slot.nbytes_after(slots)
 
     @property
     def nbytes(self) -> int:
@@ -161,7 +165,7 @@ class DenseLayer:
         return self.pool.nbytes + self._row_of_slot.nbytes + self._slot_of_row.nbytes + self._weight_of_row.nbytes
 
     def _rows_for(self, slots: Tensor) -> Tensor:
-        """Rows of distinct slots; those without one get a row of weight 0."""
+        """Look up the rows of distinct slots. Those without one get a row of weight 0."""
         rows = self.rows(slots)
         fresh = rows < 0
         count = int(fresh.sum())

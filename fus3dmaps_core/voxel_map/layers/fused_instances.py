@@ -8,7 +8,7 @@ from torch import Tensor
 from fus3dmaps_core.voxel_map.layers.fusion import FusionInputs, fuse_instances
 from fus3dmaps_core.voxel_map.layers.instances import InstanceLayer
 from fus3dmaps_core.voxel_map.rows.columns import Column
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 _FUSE_SUM_BYTES, _QUERY_SUM_BYTES = 8 * 2**20, 4 * 2**20
 _COPIED_ROWS = 128
@@ -17,13 +17,13 @@ _COPIED_ROWS = 128
 class FusedInstances:
     """Fused embeddings and evidence under the rows of the instance layer.
 
-    What is stored changes with a fusion only. Without a window a query answers with fusion of the map as it is, so beside
-    what is stored there is a second set, which is kept up to date as far as someone has asked. Instances that have not
-    changed since are not computed again.
+    The stored set changes only by :meth:`fuse`. Without a window a query answers with the fusion of the map as it is, so
+    there is a second, current set, which :meth:`refreshed` brings up to date. Instances that have not changed are not
+    computed again.
     """
 
     def __init__(self, dimension: int, windowed: bool, device: torch.device, keep_most_evidence: bool = True) -> None:
-        """Start empty; only with a window does it matter what is kept."""
+        """Start empty. ``keep_most_evidence`` matters only with a window."""
         self._device = device
         self._windowed = windowed
         self._keep_most_evidence = keep_most_evidence
@@ -33,8 +33,8 @@ class FusedInstances:
         self._current_evidence = Column(torch.float64, 0.0, device)
         self._unstored = Column(torch.bool, False, device)
 
-    def admit(self, rows: Tensor) -> None:
-        """Make room for new instances, whose rows may have been another's."""
+    def make_room(self, rows: Tensor) -> None:
+        """Make room for new instances, whose rows may have belonged to others."""
         if not len(rows):
             return
         highest = int(rows.max()) + 1
@@ -48,19 +48,18 @@ class FusedInstances:
             self._unstored[rows] = False
 
     def fuse(self, inputs: FusionInputs, full: bool) -> tuple[int, int]:
-        """Bring what is stored up to date.
+        """Fuse the layers and store the result.
 
-        Without a window the fused embedding of every instance is that of the map as it is. With one, an instance gets its
-        new fused embedding only if the new evidence is greater than the stored one [sec: Sliding Window]; unless the most
-        evidence is not kept: then it gets it always. Of an instance none of whose voxels has a dense embedding left, that
-        is its own embedding f_id.
+        Without a window every instance gets the fused embedding of the map as it is. With one, an instance gets its new
+        fused embedding only if the new evidence is greater than the stored one [sec: Sliding Window]; always, if
+        ``keep_most_evidence`` is false. If none of an instance's voxels has a dense embedding, the new one is f_id itself.
 
         Args:
-            inputs: What is fused.
+            inputs: The layers.
             full: Compute every instance, not only those that have changed; the result is the same.
 
         Returns:
-            For how many instances what is stored is now of this fusion, and how many were computed.
+            How many instances have their stored embedding from this fusion, and how many were computed.
         """
         instances = inputs.instances
         alive = instances.live()[1]
@@ -77,11 +76,11 @@ class FusedInstances:
         bars = before if self._keep_most_evidence else torch.full_like(before, -torch.inf)
         evidence = fuse_instances(inputs, rows, bars, self._stored, _FUSE_SUM_BYTES)
         self._evidence[rows] = torch.maximum(bars, evidence)
-        instances.settle(rows)
+        instances.mark_fused(rows)
         return int((evidence > before).sum()) if self._keep_most_evidence else len(alive), len(rows)
 
     def merge(self, gone: Tensor, into: Tensor) -> None:
-        """Let instances that take in others have what was stored with more evidence: of equal evidence, their own.
+        """Keep, for instances that take in others, what was stored with the most evidence; of equal evidence, their own.
 
         Args:
             gone: (n,) rows of the instances that are taken in.
@@ -102,30 +101,30 @@ class FusedInstances:
 
     def restore(self, rows: Tensor, fused: Tensor, evidence: Tensor) -> None:
         """Store fused embeddings (n, d) and evidence (n,), 0 for none."""
-        self.admit(rows)
+        self.make_room(rows)
         self._stored.write(rows, fused)
         self._evidence[rows] = evidence
 
     def evidence(self, rows: Tensor) -> Tensor:
-        """Stored evidence e_id, 0 before the first fusion: (n,) float64."""
+        """Return the stored evidence e_id, 0 before the first fusion: (n,) float64."""
         return self._evidence[rows]
 
     def stored(self, rows: Tensor, instances: InstanceLayer) -> Tensor:
-        """Stored fused embeddings; f_id itself before an instance's first fusion: (n, d) float32."""
+        """Return the stored fused embeddings; f_id itself before an instance's first fusion: (n, d) float32."""
         values = instances.pool.read(rows)
         fused = self._evidence[rows] > 0
         values[fused] = self._stored.read(rows[fused])
         return values
 
     def refreshed(self, inputs: FusionInputs) -> RowPool:
-        """The fused embeddings that a query sees, where :meth:`are_fused` says so."""
+        """Return the fused embeddings that a query sees, brought up to date; valid where :meth:`are_fused` is true."""
         if self._windowed:
             return self._stored
         self._refresh(inputs, inputs.instances.changed(), _QUERY_SUM_BYTES)
         return self._current
 
     def are_fused(self, rows: Tensor) -> Tensor:
-        """Which instances have a fused embedding; with a window, none before their first fusion: (n,) bool."""
+        """Tell which instances have a fused embedding; with a window, none before its first fusion: (n,) bool."""
         return self._evidence[rows] > 0 if self._windowed else torch.ones_like(rows, dtype=torch.bool)
 
     @property
@@ -134,8 +133,16 @@ class FusedInstances:
         columns = (self._evidence, self._current_evidence, self._unstored)
         return self._stored.nbytes + self._current.nbytes + sum(column.nbytes for column in columns)
 
+    def nbytes_after(self, rows: int) -> int:
+        """Return the most bytes that are allocated once there is room for rows 0 .. rows - 1."""
+        pools, columns = [self._stored], [self._evidence]
+        if not self._windowed:
+            pools, columns = [*pools, self._current], [*columns, self._current_evidence, self._unstored]
+        grown = sum(pool.nbytes_after(max(0, rows - pool.high_water)) for pool in pools)
+        return grown + sum(column.nbytes_after(rows) for column in columns)
+
     def _refresh(self, inputs: FusionInputs, rows: Tensor, sum_bytes: int) -> None:
         always = torch.full((len(rows),), -torch.inf, dtype=torch.float64, device=rows.device)
         self._current_evidence[rows] = fuse_instances(inputs, rows, always, self._current, sum_bytes)
         self._unstored[rows] = True
-        inputs.instances.settle(rows)
+        inputs.instances.mark_fused(rows)

@@ -5,7 +5,7 @@ With lambda = R^D / R^I and rho_i = w_i^D + lambda count[i, id]:
     f_fused,id = sum_i (w_i^D f_i^D + lambda count[i, id] f_id) / sum_i rho_i over V_id [eq. sparse_fusion]
     e_id = sum_i rho_i
 
-The counts of an instance are summed as they come, so only voxels with a dense embedding have to be visited.
+The counts of an instance are summed when they are observed, so only voxels with a dense embedding are visited.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from fus3dmaps_core.voxel_map.kernels.protocols import Fusable, Kernels
+from fus3dmaps_core.voxel_map.kernels.protocols import FusionRows, Kernels
 from fus3dmaps_core.voxel_map.layers.dense import DenseLayer
 from fus3dmaps_core.voxel_map.layers.instances import InstanceLayer
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FusionInputs:
 
 
 def fuse_instances(inputs: FusionInputs, rows: Tensor, bars: Tensor, target: RowPool, sum_bytes: int) -> Tensor:
-    """Fuse instances; what comes out for one does not depend on which others are asked for.
+    """Fuse instances. The result for one does not depend on which others are fused with it.
 
     Args:
         inputs: What is fused.
@@ -53,7 +53,7 @@ def fuse_instances(inputs: FusionInputs, rows: Tensor, bars: Tensor, target: Row
         Evidence e_id of each instance, (n,) float64.
     """
     dense, instances = inputs.dense, inputs.instances
-    voxels = Fusable(dense.pool, dense.slot_of_row(), dense.weight_of_row(), instances.held())
+    voxels = FusionRows(dense.pool, dense.slot_of_row(), dense.weight_of_row(), instances.held())
     amounts = inputs.variance_ratio * instances.observations(rows).to(torch.float64)
     evidence = torch.empty_like(amounts)
     step = max(1, sum_bytes // (8 * instances.pool.dimension))

@@ -1,9 +1,8 @@
 """The instance layer M^I: objects as overlapping sets of voxels [sec: Instance-Level Semantic Voxel Mapping].
 
-A voxel holds up to K hypotheses, pairs of an instance and an observation count. An instance has an id, which is never given
-twice, and a row under which all that is known of it is kept; rows of instances that died are given to new ones, so that
-memory follows the instances alive. Voxels refer to rows: no voxel refers to the row of an instance that died, for it
-died because none did.
+A voxel holds up to K hypotheses, pairs of an instance and an observation count. An instance has an id, which is never
+reused, and a row under which everything known of it is kept. An instance dies when no voxel holds it any more; its row is
+then reused, so that memory follows the instances alive. Voxels refer to instances by row.
 """
 
 from __future__ import annotations
@@ -12,12 +11,12 @@ import torch
 from torch import Tensor
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxel_map.kernels.protocols import Extents, Hypotheses, Kernels, Pairs
+from fus3dmaps_core.voxel_map.kernels.protocols import Extents, GroupedCounts, Hypotheses, Kernels
 from fus3dmaps_core.voxel_map.rows.columns import Column
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 MAX_ID = 2**31 - 1
-"""Ids end here, for messages and files hold them in 32 bits."""
+"""Largest id, because messages and files hold ids in 32 bits."""
 
 
 class InstanceLayer:
@@ -26,7 +25,7 @@ class InstanceLayer:
     def __init__(
         self, dimension: int, max_hypotheses: int, iou_threshold: float, kernels: Kernels, device: torch.device
     ) -> None:
-        """Start empty; embeddings are float32, for there are few of them."""
+        """Start empty. Embeddings are float32, because there are few of them."""
         self._kernels = kernels
         self._device = device
         self._iou_threshold = iou_threshold
@@ -41,41 +40,41 @@ class InstanceLayer:
         self._changed = Column(torch.bool, False, device)
 
     def __len__(self) -> int:
-        """Number of instances alive."""
+        """Return the number of instances alive."""
         return len(self.pool)
 
     def reserve(self, slots: int) -> None:
         """Make slots 0 .. slots - 1 addressable."""
-        self._held_row.reserve(slots)
-        self._held_count.reserve(slots)
+        for column in self._columns_of_slots():
+            column.reserve(slots)
 
     def live(self) -> tuple[Tensor, Tensor]:
-        """Ids of the instances alive, ascending, and their rows: two (n,) int64."""
+        """Return the ids of the instances alive, ascending, and their rows: two (n,) int64."""
         ids = self._id_of_row[: self.pool.high_water]
         rows = torch.nonzero(ids >= 0).squeeze(1)
         ordered, order = torch.sort(ids.index_select(0, rows))
         return ordered, rows.index_select(0, order)
 
     def ids(self, rows: Tensor) -> Tensor:
-        """Id of each row, -1 for row -1: (n,) int64."""
+        """Look up the id of each row, -1 for row -1: (n,) int64."""
         if not self.pool.high_water:
             return rows
         return torch.where(rows >= 0, self._id_of_row[rows.clamp(min=0).flatten()].view(rows.shape), -1)
 
     def held(self) -> Tensor:
-        """Rows that each slot holds, -1 where empty: (slots, K) int32, not a copy."""
+        """Return the rows that each slot holds, -1 where empty: (slots, K) int32, a view."""
         return self._held_row[:]
 
     def hypotheses(self, slots: Tensor | slice) -> tuple[Tensor, Tensor]:
-        """Rows (-1 where empty) and counts of the slots' hypotheses: two (n, K) int64, in no meaningful order."""
+        """Return rows (-1 where empty) and counts of the slots' hypotheses: two (n, K) int64, in no meaningful order."""
         return self._held_row[slots].to(torch.int64), self._held_count[slots].to(torch.int64)
 
     def top(self, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """Per slot the row with the highest count (ties: the lowest id; -1 without any) and that count: (n,) int64."""
+        """Find per slot the row with the highest count (ties: the lowest id; -1 without any) and that count: (n,) int64."""
         return self._kernels.top_hypotheses(self.columns(), slots)
 
     def columns(self) -> Hypotheses:
-        """What kernels work on, not a copy."""
+        """Return the columns that kernels work on, as views."""
         rows = slice(0, self.pool.high_water)
         return Hypotheses(
             self._held_row[:],
@@ -87,27 +86,27 @@ class InstanceLayer:
         )
 
     def weights(self, rows: Tensor) -> Tensor:
-        """Weight w_id: (n,) float64."""
+        """Look up the weights w_id: (n,) float64."""
         return self._weight_of_row[rows]
 
     def voxels(self, rows: Tensor) -> Tensor:
-        """|V_id|, the voxels that hold the instance as a hypothesis: (n,) int64."""
+        """Look up |V_id|, the number of voxels that hold an instance as a hypothesis: (n,) int64."""
         return self._voxels_of_row[rows].to(torch.int64)
 
     def observations(self, rows: Tensor) -> Tensor:
-        """Sum of the instance's counts over V_id: (n,) int64."""
+        """Look up the sums of the instances' counts over V_id: (n,) int64."""
         return self._observations_of_row[rows]
 
     def changed(self) -> Tensor:
-        """Rows of the instances alive whose fusion may have changed since it was settled: (n,) int64 ascending."""
+        """Find the instances alive that may have changed since they were marked as fused: (n,) int64 rows, ascending."""
         return torch.nonzero(self._changed[: self.pool.high_water]).squeeze(1)
 
-    def settle(self, rows: Tensor) -> None:
-        """Note that the fusion of the rows is known."""
+    def mark_fused(self, rows: Tensor) -> None:
+        """Mark instances as fused: their fused embeddings are up to date."""
         self._changed[rows] = False
 
-    def touch(self, slots: Tensor) -> None:
-        """Note that the dense layer has changed in the slots."""
+    def mark_changed(self, slots: Tensor) -> None:
+        """Mark the instances that the slots hold as changed, because the dense layer has changed there."""
         held = self._held_row[slots]
         self._changed[held.masked_select(held >= 0).to(torch.int64)] = True
 
@@ -118,14 +117,16 @@ class InstanceLayer:
         self.pool.check_room(count)
 
     def extents(self) -> Extents:
-        """What the instances occupy, before any voxel was added to it: by row."""
+        """Make empty extents, one for each row, to which voxels are added."""
         rows = self.pool.high_water
         none = torch.zeros(rows, dtype=torch.int64, device=self._device)
         nowhere = torch.zeros((rows, 3), dtype=torch.int64, device=self._device)
         far = torch.full_like(nowhere, 2**62)
         return Extents(voxels=none, counts=none.clone(), sums=nowhere, low=far, high=-far)
 
-    def integrate(self, proposals: Pairs, embeddings: Tensor, visible: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def associate(
+        self, proposals: GroupedCounts, embeddings: Tensor, visible: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Associate proposals with instances, in order, and update both [sec: Geometric Instance Association].
 
         Args:
@@ -135,18 +136,18 @@ class InstanceLayer:
                 of an instance: |V_m n V_id| / |V_m u (V_id n V_visible)|.
 
         Returns:
-            Id of each proposal's instance, (m,) int64, -1 for one without points; and rows of the instances that it made.
+            Id of each proposal's instance, (m,) int64, -1 for one without points; and the rows of new instances.
         """
         spare = self.pool.allocate(len(embeddings))
         self._reserve_rows()
         hidden = None if visible is None else self._hidden(visible)
-        outcome = self._kernels.integrate(self.columns(), proposals, spare, self.next_id, self._iou_threshold, hidden)
+        outcome = self._kernels.associate(self.columns(), proposals, spare, self.next_id, self._iou_threshold, hidden)
         ends = torch.zeros(len(proposals.counts) + 1, dtype=torch.int64, device=self._device)
         ends[1:] = torch.cumsum(proposals.counts, 0)
         self._average(outcome.rows, ends.index_select(0, proposals.offsets).diff(), embeddings)
         self.next_id += outcome.created
         self.pool.free(spare[outcome.created :])
-        self._bury(outcome.dead)
+        self._free_rows(outcome.dead)
         return outcome.ids, spare[: outcome.created]
 
     def take_in(self, gone: Tensor, into: Tensor, slots: Tensor) -> None:
@@ -159,10 +160,10 @@ class InstanceLayer:
         """
         self._kernels.merge(self.columns(), slots, gone, into)
         self._average(into, self._weight_of_row[gone], self.pool.read(gone))
-        self._bury(gone)
+        self._free_rows(gone)
 
     def forget(self, slots: Tensor) -> None:
-        """Empty the hypotheses of distinct slots; instances left without voxel die."""
+        """Empty the hypotheses of distinct slots. Instances left without a voxel die."""
         held, counts = self.hypotheses(slots)
         used = held >= 0
         losers, index, lost = torch.unique(held[used], return_inverse=True, return_counts=True)
@@ -173,7 +174,7 @@ class InstanceLayer:
         self._held_count[slots] = 0
         dead = losers[self._voxels_of_row[losers] == 0]
         self._id_of_row[dead] = -1
-        self._bury(dead)
+        self._free_rows(dead)
 
     def restore(
         self, slots: Tensor, ids: Tensor, counts: Tensor, next_id: int, alive: Tensor, weights: Tensor, embeddings: Tensor
@@ -215,35 +216,40 @@ class InstanceLayer:
     @property
     def nbytes(self) -> int:
         """Allocated bytes."""
-        columns = (
-            self._held_row,
-            self._held_count,
-            self._id_of_row,
-            self._weight_of_row,
-            self._voxels_of_row,
-            self._observations_of_row,
-            self._changed,
+        return self.pool.nbytes + sum(column.nbytes for column in (*self._columns_of_slots(), *self._columns_of_rows()))
+
+    def nbytes_after(self, slots: int, count: int) -> int:
+        """Return the most bytes that are allocated with slots 0 .. slots - 1 and ``count`` more instances."""
+        rows = self.pool.high_water_after(count)
+        of_slots = sum(column.nbytes_after(slots) for column in self._columns_of_slots())
+        return (
+            self.pool.nbytes_after(count) + of_slots + sum(column.nbytes_after(rows) for column in self._columns_of_rows())
         )
-        return self.pool.nbytes + sum(column.nbytes for column in columns)
+
+    def _columns_of_slots(self) -> tuple[Column, ...]:
+        return self._held_row, self._held_count
+
+    def _columns_of_rows(self) -> tuple[Column, ...]:
+        return self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed
 
     def _reserve_rows(self) -> None:
-        for column in (self._id_of_row, self._weight_of_row, self._voxels_of_row, self._observations_of_row, self._changed):
+        for column in self._columns_of_rows():
             column.reserve(self.pool.high_water)
 
     def _hidden(self, visible: Tensor) -> Tensor:
-        """How many voxels each instance has outside of distinct slots: (rows,) int32.
+        """Count the voxels that each instance has outside of distinct slots: (rows,) int32.
 
-        It stays the same while proposals are integrated all of whose slots are among them.
+        The counts stay valid while proposals are associated whose slots are all among them.
         """
         held = self._held_row[visible]
         seen = torch.bincount(held.masked_select(held >= 0), minlength=self.pool.high_water)
         return self._voxels_of_row[: self.pool.high_water] - seen.to(torch.int32)
 
     def _average(self, rows: Tensor, points: Tensor, embeddings: Tensor) -> None:
-        """f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the m that are given to an instance.
+        """Update f_id = (w_id f_id + sum of N_m f_m) / (w_id + sum of N_m) over the m that an instance was given.
 
         Args:
-            rows: (m,) row of the instance that each is given to, -1 for none.
+            rows: (m,) row of the instance that each was given to, -1 for none.
             points: (m,) N_m.
             embeddings: (m, d) f_m.
         """
@@ -260,8 +266,8 @@ class InstanceLayer:
         self._kernels.merge_means(self.pool, owners, *weights, seeds, groups, amounts, embeddings)
         self._weight_of_row[owners] = new
 
-    def _bury(self, dead: Tensor) -> None:
-        """Give up the rows of instances without voxels."""
+    def _free_rows(self, dead: Tensor) -> None:
+        """Free the rows of instances that have died."""
         for column in (self._weight_of_row, self._observations_of_row, self._changed):
             column[dead] = 0
         self.pool.free(dead)

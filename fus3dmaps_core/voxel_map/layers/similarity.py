@@ -1,4 +1,4 @@
-"""The layers that can be asked, as kernels compare them with texts."""
+"""The layers that can be queried, in the form in which kernels compare them with texts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _BLOCK_COSINES = 2**18  # Cosines of instances that are computed together: a meg
 
 
 def layer_named(name: str, inputs: FusionInputs, fused: FusedInstances, texts: Texts) -> EmbeddedLayer | InheritedLayer:
-    """A layer and what it is compared with.
+    """Put together a layer and the texts that it is compared with.
 
     Dense: the voxels that have an embedding. Fused dense: those that have either layer,
     f_fused,i = (w_i^D f_i^D + lambda c_i f_top(i)) / (w_i^D + lambda c_i), where c_i is the count of the top hypothesis.
@@ -26,7 +26,7 @@ def layer_named(name: str, inputs: FusionInputs, fused: FusedInstances, texts: T
     Args:
         name: One of LAYERS.
         inputs: The layers of the map.
-        fused: Fused embeddings of the instances, which are brought up to date where a query sees them so.
+        fused: Fused embeddings of the instances, which are brought up to date where the layer needs them.
         texts: What the layer is compared with.
     """
     if name in ("dense", "fused_dense"):
@@ -36,7 +36,7 @@ def layer_named(name: str, inputs: FusionInputs, fused: FusedInstances, texts: T
 
 
 def _instance_scores(inputs: FusionInputs, fused: FusedInstances | None, texts: Texts) -> Tensor:
-    """Scores of all instances alive by their row, (rows, p) float32; of their own embeddings without ``fused``."""
+    """Score all instances alive, by row: (rows, p) float32; by their own embeddings without ``fused``."""
     instances, kernels = inputs.instances, inputs.kernels
     scores = texts.vectors.new_zeros((instances.pool.high_water, texts.prompts))
     fused_pool = None if fused is None else fused.refreshed(inputs)

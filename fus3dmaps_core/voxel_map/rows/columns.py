@@ -5,9 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+_LEAST_ROWS = 1024
+
 
 class Column:
-    """A tensor that grows by doubling; rows beyond those ever written hold the fill value."""
+    """A tensor that grows by doubling. Rows that were never written hold the fill value."""
 
     def __init__(self, dtype: torch.dtype, fill: int | float, device: torch.device, width: int | None = None) -> None:
         """Start empty; ``width`` gives every row that many values instead of one."""
@@ -20,9 +22,8 @@ class Column:
         capacity = len(self._data)
         if rows <= capacity:
             return
-        grown = torch.full(
-            (max(rows, 2 * capacity, 1024), *self._trailing), self._fill, dtype=self._data.dtype, device=self._data.device
-        )
+        length = max(rows, 2 * capacity, _LEAST_ROWS)
+        grown = torch.full((length, *self._trailing), self._fill, dtype=self._data.dtype, device=self._data.device)
         grown[:capacity] = self._data
         self._data = grown
 
@@ -30,7 +31,7 @@ class Column:
     # each such call waits a time slice for them.
 
     def __getitem__(self, rows: Tensor | slice) -> Tensor:
-        """Values of the rows, a copy for (n,) int64 and no copy for a slice."""
+        """Return the values of the rows: a copy for (n,) int64, a view for a slice."""
         return self._data[rows] if isinstance(rows, slice) else self._data.index_select(0, rows)
 
     def __setitem__(self, rows: Tensor | slice, values: Tensor | int | float) -> None:
@@ -43,6 +44,20 @@ class Column:
             self._data.index_fill_(0, rows, values)
 
     @property
+    def row_nbytes(self) -> int:
+        """Bytes of one row."""
+        return self._data.element_size() * (self._trailing[0] if self._trailing else 1)
+
+    @property
     def nbytes(self) -> int:
         """Allocated bytes."""
-        return self._data.numel() * self._data.element_size()
+        return len(self._data) * self.row_nbytes
+
+    def nbytes_after(self, rows: int) -> int:
+        """Return the most bytes that are allocated once ``rows`` rows are reserved, in however many steps."""
+        capacity = len(self._data)
+        if rows > capacity:
+            doubled = max(2 * capacity, _LEAST_ROWS)
+            # A first step that doubles may be followed by a second one that does so again.
+            capacity = doubled if rows <= doubled else 2 * rows
+        return capacity * self.row_nbytes

@@ -25,19 +25,19 @@ _WORD = 0xFFFFFFFF
 
 
 def seeds_of(keys: Tensor, weights: Tensor) -> Tensor:
-    """A seed for each voxel and state: (n,) int64 of 32 bits from its key and the bits of its float32 weight."""
+    """Return a seed for each voxel and state: (n,) int64 of 32 bits from its key and the bits of its float32 weight."""
     place = _mix((keys ^ (keys >> 32)) & _WORD)  # Mixed first, or neighbours' weights would meet in the same seed.
     return _mix((place + weights.view(torch.int32).to(torch.int64)) & _WORD)
 
 
 def dither(seeds: Tensor, width: int) -> Tensor:
-    """Random bits: (n, width) int64 of 32 bits."""
+    """Return random bits: (n, width) int64 of 32 bits."""
     columns = torch.arange(width, dtype=torch.int64, device=seeds.device) * 0x9E3779B9
     return _mix((seeds[:, None] + columns) & _WORD)
 
 
 def to_half(values: Tensor, seeds: Tensor) -> Tensor:
-    """Float32 values of at most 1 as halves: (n, d) float16, each rounded up with the probability of its fraction.
+    """Convert float32 values of at most 1 to halves, (n, d) float16, each rounded up with the probability of its fraction.
 
     Below 2^-14, where halves are 2^-24 apart, they are rounded to the nearest.
     """
@@ -46,7 +46,7 @@ def to_half(values: Tensor, seeds: Tensor) -> Tensor:
 
 
 def to_int8(values: Tensor, scales: Tensor, seeds: Tensor) -> tuple[Tensor, Tensor]:
-    """Float32 values as steps of a scale per row.
+    """Convert float32 values to steps of a scale per row.
 
     Args:
         values: (n, d) float32.
@@ -65,7 +65,7 @@ def to_int8(values: Tensor, scales: Tensor, seeds: Tensor) -> tuple[Tensor, Tens
 
 
 def _mix(bits: Tensor) -> Tensor:
-    """A hash of 32-bit words in int64."""
+    """Hash 32-bit words in int64."""
     bits = bits ^ (bits >> 16)
     bits = (bits * 0x7FEB352D) & _WORD
     bits = bits ^ (bits >> 15)

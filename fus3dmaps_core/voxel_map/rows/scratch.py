@@ -1,7 +1,7 @@
 """Arrays that are needed for a moment, again and again.
 
-The memory of a fresh array is made by the system page by page as it is touched, which for megabytes takes longer than what
-is computed in them, and stops other threads meanwhile. So memory that was used is kept for the next one who asks.
+The system makes the memory of a fresh array page by page as it is touched. For megabytes that takes longer than what is
+computed in them, and it stops other threads meanwhile. So memory that was used is kept for the next call.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ class Scratch:
     """Lends arrays; safe to use from several threads."""
 
     def __init__(self, kept_bytes: int = _KEPT_BYTES) -> None:
-        """Keep at most so many bytes while nobody uses them."""
+        """Keep at most ``kept_bytes`` while nobody uses them."""
         self._kept_bytes = kept_bytes
         self._kept: list[NDArray[np.uint8]] = []
         self._lock = threading.Lock()
 
     @contextmanager
     def lend(self, shape: tuple[int, ...], dtype: DTypeLike) -> Iterator[NDArray[Any]]:
-        """An array of undefined content, for as long as the context lasts."""
+        """Lend an array of undefined content for as long as the context lasts."""
         nbytes = math.prod(shape) * np.dtype(dtype).itemsize
         buffer = self._take(1 << max(nbytes - 1, 63).bit_length())  # Few sizes, so that what is kept fits the next one.
         try:

@@ -20,8 +20,9 @@ from reference.vectors import cosine
 from fus3dmaps_core.answers.labels import label_voxels
 from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.voxel_map import search
+from fus3dmaps_core.voxel_map import map_scan
 from fus3dmaps_core.voxel_map.kernels import compiled_kernels
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
@@ -130,7 +131,7 @@ def random_map(backend: str, device: str) -> SemanticMap:
 
 def one_by_one(semantic_map: SemanticMap, layer: str, vectors: np.ndarray) -> np.ndarray:
     """Cosines (p, n) of each text with each voxel, a question for each text."""
-    return np.stack([semantic_map.search(layer, vector[None]).similarity for vector in vectors])
+    return np.stack([semantic_map.search(LayerQuery(layer, vector[None])).similarity for vector in vectors])
 
 
 @pytest.mark.parametrize("layer", LAYERS)
@@ -141,9 +142,9 @@ def test_labels_are_those_of_a_question_for_each_label(mapped, layer, count, sum
     vectors = embeddings_of(count, WIDTH, np.random.default_rng(count))
     expected = one_by_one(mapped, layer, vectors)
     if sum_bytes is not None:
-        monkeypatch.setattr(search, "_SUM_BYTES", sum_bytes)
+        monkeypatch.setattr(map_scan, "_SUM_BYTES", sum_bytes)
     found = mapped.label(layer, vectors)
-    np.testing.assert_array_equal(found.points_m, mapped.search(layer, vectors[:1]).points_m)
+    np.testing.assert_array_equal(found.points_m, mapped.search(LayerQuery(layer, vectors[:1])).points_m)
     np.testing.assert_allclose(found.scores, expected.max(axis=0), atol=1e-6)
     chosen = np.take_along_axis(expected, found.labels[None].astype(int), axis=0)[0]
     np.testing.assert_allclose(chosen, expected.max(axis=0), atol=2e-6)
@@ -171,12 +172,12 @@ def test_a_map_of_ordinary_size_is_looked_at_once(mapped, layer, monkeypatch):
 @pytest.mark.parametrize("sum_bytes", [None, 0])
 def test_an_instance_has_the_label_whose_ranking_it_leads_most(mapped, layer, sum_bytes, monkeypatch):
     vectors = embeddings_of(9, WIDTH, np.random.default_rng(2))
-    ranked = mapped.search(layer, vectors, top_k=1000)
+    ranked = mapped.search(LayerQuery(layer, vectors, top_k=1000))
     means = np.full((len(vectors), len(ranked.instances.ids)), np.nan)
     for text, (places, scores) in enumerate(ranked.best):
         means[text, places] = scores
     if sum_bytes is not None:
-        monkeypatch.setattr(search, "_SUM_BYTES", sum_bytes)
+        monkeypatch.setattr(map_scan, "_SUM_BYTES", sum_bytes)
     found = mapped.label(layer, vectors)
     np.testing.assert_array_equal(found.instances.ids, ranked.instances.ids)
     assert len(found.instances.ids) == 8
@@ -197,7 +198,7 @@ def test_an_instance_without_a_voxel_of_the_layer_has_no_label(mapped):
 @pytest.mark.parametrize("sum_bytes", [None, 0])
 def test_of_many_equal_texts_the_first_wins_wherever_they_are(mapped, layer, sum_bytes, monkeypatch):
     if sum_bytes is not None:
-        monkeypatch.setattr(search, "_SUM_BYTES", sum_bytes)
+        monkeypatch.setattr(map_scan, "_SUM_BYTES", sum_bytes)
     few = embeddings_of(3, WIDTH, np.random.default_rng(4))
     once, often = mapped.label(layer, few), mapped.label(layer, few[[0, 0, 1, 0, 1, 2, 2, 1, 0, 2, 1]])
     np.testing.assert_array_equal(often.labels, np.array([0, 2, 5])[once.labels])
@@ -209,7 +210,7 @@ def test_of_many_equal_texts_the_first_wins_wherever_they_are(mapped, layer, sum
 @pytest.mark.parametrize("backend", ["compiled", "torch"])
 def test_of_different_texts_that_fit_equally_well_the_first_wins(backend, sum_bytes, monkeypatch):
     if sum_bytes is not None:
-        monkeypatch.setattr(search, "_SUM_BYTES", sum_bytes)
+        monkeypatch.setattr(map_scan, "_SUM_BYTES", sum_bytes)
     semantic_map = SemanticMap(3, MapConfig(voxel_size_m=SIZE_M, backend=backend), 1.0)
     see(semantic_map, range(4), X)
     semantic_map.integrate_proposals(points(range(4)), np.zeros(4, int), X[None])
@@ -241,8 +242,8 @@ def test_labels_elsewhere_are_those_here():
     here = random_map("torch", "cpu")
     with elsewhere() as device, pytest.MonkeyPatch.context() as patch:
         there = random_map("torch", device)
-        for layer, sum_bytes in itertools.product(LAYERS, (search._SUM_BYTES, 0)):
-            patch.setattr(search, "_SUM_BYTES", sum_bytes)
+        for layer, sum_bytes in itertools.product(LAYERS, (map_scan._SUM_BYTES, 0)):
+            patch.setattr(map_scan, "_SUM_BYTES", sum_bytes)
             mine, theirs = here.label(layer, vectors), there.label(layer, vectors)
             np.testing.assert_array_equal(mine.points_m, theirs.points_m)
             np.testing.assert_allclose(mine.scores, theirs.scores, atol=1e-6)

@@ -25,12 +25,13 @@ from fus3dmaps_core.saved_maps.storage import (
     restore_map,
     save_map,
 )
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 
 def cosines(semantic_map: SemanticMap, layer: str) -> np.ndarray:
-    return np.stack([semantic_map.search(layer, prompt[None]).similarity for prompt in np.eye(2, 6)])
+    return np.stack([semantic_map.search(LayerQuery(layer, prompt[None])).similarity for prompt in np.eye(2, 6)])
 
 
 @pytest.mark.parametrize("dtype", DTYPES)

@@ -13,6 +13,7 @@ from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.voxel_map.budget import KeyframeBound, MemoryBudget, MemoryUse
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
@@ -269,7 +270,7 @@ def test_a_long_drive_keeps_within_the_budget(backend: str, device: str, dtype: 
         if number % 10 == 9:
             _, _, objects = keyframe(number)
             for layer in LAYERS:
-                finding = bound.map.search(layer, embedding_of(objects[:1]).astype(np.float32), min_voxels=4)
+                finding = bound.map.search(LayerQuery(layer, embedding_of(objects[:1]).astype(np.float32), min_voxels=4))
                 if layer == "dense":
                     assert finding.voxels == bound.map.dense_voxel_count > 0
                 _, scores = finding.best[0]

@@ -13,7 +13,8 @@ from reference.steps import Setting
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.errors import MapError, QueryError
-from fus3dmaps_core.voxel_map.rows import numbers
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
+from fus3dmaps_core.voxel_map.rows import number_pool as numbers
 
 DENSE = {
     "points_m": np.array([[0.01, 0.02, 0.03], [9.0, 9.0, 9.0]]),
@@ -140,19 +141,19 @@ def test_bad_texts_are_refused_and_leave_no_trace(setting: Setting, which: str, 
     engine = used_map(setting)
     given = {"prompts": np.ones((1, setting.dimension)), which: texts}
     with refused(engine, setting, match=which):
-        engine.search("fused_instances", **given)
+        engine.search(LayerQuery("fused_instances", **given))
 
 
 def test_no_prompt_is_refused_and_leaves_no_trace(setting: Setting):
     engine = used_map(setting)
     with refused(engine, setting, QueryError, "prompts"):
-        engine.search("dense", np.ones((0, setting.dimension)))
+        engine.search(LayerQuery("dense", np.ones((0, setting.dimension))))
 
 
 def test_an_unknown_layer_is_refused_and_leaves_no_trace(setting: Setting):
     engine = used_map(setting)
     with refused(engine, setting, QueryError, "panoptic"):
-        engine.search("panoptic", np.ones((1, setting.dimension)))
+        engine.search(LayerQuery("panoptic", np.ones((1, setting.dimension))))
 
 
 @pytest.mark.parametrize("what", ["voxels", "embeddings"])

@@ -13,6 +13,7 @@ from reference.steps import FuseStep, RemoveStep, Setting, WindowStep, random_st
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES
 
 from fus3dmaps_core.config.schema import MapConfig
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
@@ -27,7 +28,7 @@ in_every_dtype = pytest.mark.parametrize("dtype", DTYPES)
 def ask(engine: SemanticMap) -> None:
     """A query of every layer: it may compute what the next fusion would, but must not show in what is stored."""
     for layer in LAYERS:
-        engine.search(layer, np.eye(1, engine.dimension, dtype=np.float32))
+        engine.search(LayerQuery(layer, np.eye(1, engine.dimension, dtype=np.float32)))
 
 
 @on_every_backend

@@ -10,7 +10,7 @@ from reference.steps import Setting, dense_step, proposal_step
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES, kernels_of
 
 from fus3dmaps_core.voxel_map.kernels.keys import pack
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 from fus3dmaps_core.voxel_map.voxel_hash import VoxelHash
 
 MOST_ALIVE = 40_000

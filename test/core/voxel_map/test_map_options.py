@@ -136,7 +136,7 @@ def test_what_a_rehearsal_compiles_is_what_a_map_runs():
     warm_up(setting.dimension, engine.config)
     for step in random_steps(setting, extent=3, count=40, seed=7):
         step.apply(engine)
-    for name in ("integrate", "holders", "shared_voxels", "merge"):
+    for name in ("associate", "holders", "shared_voxels", "merge"):
         assert len(getattr(numba_instances, name).signatures) == 1, name
 
 

@@ -12,7 +12,7 @@ from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
 from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.voxel_map.kernels.keys import MAX_COORDINATE, pack
 from fus3dmaps_core.voxel_map.kernels.protocols import EMPTY
-from fus3dmaps_core.voxel_map.rows import numbers
+from fus3dmaps_core.voxel_map.rows import number_pool as numbers
 from fus3dmaps_core.voxel_map.voxel_hash import VoxelHash
 
 _axis = st.one_of(

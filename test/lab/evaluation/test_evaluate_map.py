@@ -17,6 +17,7 @@ from sklearn.metrics import accuracy_score, jaccard_score, recall_score
 
 from fus3dmaps_core.config.schema import MapConfig
 from fus3dmaps_core.errors import MapError, QueryError
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from fus3dmaps_lab.evaluation.evaluate_map import INSTANCE_LAYERS, EvaluationProtocol, evaluate_map
 from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth, voxel_truth
@@ -245,7 +246,7 @@ def test_instances_are_ranked_as_a_query_ranks_them(seed, layer):
     )
     owner = np.where(top >= 0, np.searchsorted(ids, top), -1)
     scores = instance_scores(owner, cosines, len(ids))
-    asked = engine.search(layer, vectors, top_k=len(ids) + 1)
+    asked = engine.search(LayerQuery(layer, vectors, top_k=len(ids) + 1))
     for column, (best, means) in enumerate(asked.best):
         assert sorted(best.tolist()) == np.flatnonzero(np.isfinite(scores[:, column])).tolist()
         np.testing.assert_allclose(scores[best, column], means, rtol=0, atol=1e-6)

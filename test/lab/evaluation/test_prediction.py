@@ -129,10 +129,10 @@ def test_a_map_that_changes_meanwhile_is_refused():
     class Changing(SemanticMap):
         """Gets a voxel with every question."""
 
-        def search(self, *args, **options):
+        def search(self, query):
             point = np.full((1, 3), self.voxel_count + 0.5)
             self.integrate_dense(point, np.zeros(1, int), np.eye(3)[:1], np.ones(1), np.zeros((1, 3), np.uint8))
-            return super().search(*args, **options)
+            return super().search(query)
 
     with pytest.raises(MapError, match="layer 'dense' was changed"):
         layer_cosines(Changing(3, MapConfig(), 1.0), "dense", np.eye(3))

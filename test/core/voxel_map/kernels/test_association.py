@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from reference.columns import columns
 from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
 
-from fus3dmaps_core.voxel_map.kernels.protocols import Pairs
+from fus3dmaps_core.voxel_map.kernels.protocols import GroupedCounts
 
 _seeds = st.integers(0, 2**32 - 1)
 MAX_COUNT = 2**31 - 1
@@ -83,7 +83,7 @@ def test_proposals_are_associated_counted_and_displace_as_in_dictionaries(backen
             {int(slot): int(rng.integers(1, 4)) for slot in rng.permutation(slots)[: rng.integers(0, slots + 1)]}
             for _ in range(proposals)
         ]
-        groups = Pairs(
+        groups = GroupedCounts(
             *(
                 torch.tensor(np.array(each, np.int64), device=device)
                 for each in (
@@ -101,7 +101,7 @@ def test_proposals_are_associated_counted_and_displace_as_in_dictionaries(backen
             for each in id_of_row
         ]
         rule = (threshold,) if all_count else (threshold, torch.tensor(hidden, dtype=torch.int32, device=device))
-        outcome = kernels.integrate(held, groups, torch.tensor(spare, dtype=torch.int64, device=device), 100, *rule)
+        outcome = kernels.associate(held, groups, torch.tensor(spare, dtype=torch.int64, device=device), 100, *rule)
 
         plain = PlainAssociation([dict(of_voxel) for of_voxel in by_id], places, 100, threshold, visible)
         expected = [plain.take(each) if each else -1 for each in hits]

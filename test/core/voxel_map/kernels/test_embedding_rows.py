@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from reference.agreement import ROUNDING
 from reference.variants import BACKEND_IDS, BACKENDS, DTYPES, kernels_of
 
-from fus3dmaps_core.voxel_map.kernels.protocols import Fusable, Pairs
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.kernels.protocols import FusionRows, GroupedCounts
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 _seeds = st.integers(0, 2**32 - 1)
 in_every_dtype = pytest.mark.parametrize("dtype", DTYPES)
@@ -143,7 +143,7 @@ def test_means_are_merged(backend, dtype: str):
         old = (rng.uniform(0.01, 1e3, count) * rng.choice([1.0, 100.0], count)).astype(np.float32)
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         new = np.array([old[i] + amounts[offsets[i] : offsets[i + 1]].sum() for i in range(count)], np.float32)
-        groups = Pairs(*(torch.tensor(each, device=device) for each in (offsets, partners, np.ones_like(partners))))
+        groups = GroupedCounts(*(torch.tensor(each, device=device) for each in (offsets, partners, np.ones_like(partners))))
         tensors = (torch.tensor(each, device=device) for each in (rows, old, new, rng.integers(0, 2**32, count)))
         kernels.merge_means(
             pool, *tensors, groups, torch.tensor(amounts, device=device), torch.tensor(embeddings, device=device)
@@ -171,7 +171,7 @@ def test_a_fresh_row_shows_nothing_of_what_lay_there(backend, dtype: str):
     rng = np.random.default_rng(1)
     embeddings = torch.tensor(unit(rng.normal(size=(1500, 33))), dtype=torch.float32, device=device)
     each = torch.arange(1500, device=device)
-    groups = Pairs(torch.arange(1501, device=device), each, torch.ones_like(each))
+    groups = GroupedCounts(torch.arange(1501, device=device), each, torch.ones_like(each))
     weights = torch.full((1500,), 0.375, device=device)
     kernels.merge_means(pool, rows, torch.zeros_like(weights), weights, each, groups, weights, embeddings)
     np.testing.assert_allclose(pool.read(rows).cpu().numpy(), embeddings.cpu().numpy(), atol=1e-6 + ROUNDING[dtype])
@@ -192,7 +192,7 @@ def test_backends_store_the_same_bytes(dtype: str):
         )
         embeddings = torch.tensor(values, dtype=torch.float32, device=device)
         each = torch.arange(2000, device=device)
-        groups = Pairs(torch.arange(2001, device=device), each, torch.ones_like(each))
+        groups = GroupedCounts(torch.arange(2001, device=device), each, torch.ones_like(each))
         seeds = torch.tensor(rng.integers(0, 2**32, 2000), device=device)
         ones = torch.ones(2000, device=device)
         kernels.merge_means(pool, rows, torch.zeros_like(ones), ones, seeds, groups, ones, embeddings)
@@ -210,7 +210,7 @@ def test_a_mean_does_not_depend_on_the_unit_of_weight(backend, dtype: str, weigh
     kernels, device = backend
     pool = RowPool(3, getattr(torch, dtype), device)
     rows = pool.allocate(1)
-    groups = Pairs(*(torch.tensor(each, device=device) for each in ([0, 1], [0], [1])))
+    groups = GroupedCounts(*(torch.tensor(each, device=device) for each in ([0, 1], [0], [1])))
     weights, seeds = torch.tensor([weight], device=device), torch.zeros(1, dtype=torch.int64, device=device)
     first, second = (torch.tensor([each], device=device) for each in ([0.6, 0.8, 0.0], [0.8, 0.0, 0.6]))
     kernels.merge_means(pool, rows, torch.zeros_like(weights), weights, seeds, groups, weights, first)
@@ -286,7 +286,7 @@ class Fusion:
         where = torch.tensor(np.asarray(rows, np.int64), device=device)
         bars = np.full(len(rows), -np.inf) if bars is None else bars
         given = (torch.tensor(each, device=device) for each in (self.amounts[rows], bars))
-        evidence = kernels.fuse(Fusable(self.pool, *tensors), where, self.own, *given, target)
+        evidence = kernels.fuse(FusionRows(self.pool, *tensors), where, self.own, *given, target)
         assert evidence.dtype == torch.float64
         return target.read(where).cpu().numpy(), evidence.cpu().numpy()
 
@@ -369,7 +369,7 @@ def test_results_do_not_depend_on_the_number_of_threads(backend, set_threads, dt
     texts = torch.tensor(unit(rng.normal(size=(3, 40))), dtype=torch.float32, device=device)
     embeddings = torch.tensor(rng.normal(size=(9000, 40)), device=device)
     each = torch.arange(9000, device=device)
-    groups = Pairs(torch.arange(9001, device=device), each, torch.ones_like(each))
+    groups = GroupedCounts(torch.arange(9001, device=device), each, torch.ones_like(each))
     weights = torch.full((9000,), 0.25, device=device)
 
     def everything() -> list[bytes]:

@@ -200,7 +200,7 @@ def test_a_table_finds_what_was_put_into_it_and_not_what_was_taken_out(backend):
                 used += len(fresh)
             else:
                 gone = [each for each in keys if each in plain]
-                kernels.bury(table, integers(gone, device))
+                kernels.mark_deleted(table, integers(gone, device))
                 for each in gone:
                     del plain[each]
             everything = sorted(asked) * 2

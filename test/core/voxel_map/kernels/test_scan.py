@@ -28,7 +28,7 @@ from fus3dmaps_core.voxel_map.kernels.protocols import (
     Texts,
 )
 from fus3dmaps_core.voxel_map.kernels.torch_kernels import TorchKernels
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 SIZE_M = 0.25
 ID_OF_ROW = [4, -1, 9, 2, 7]

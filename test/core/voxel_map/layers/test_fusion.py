@@ -9,6 +9,7 @@ import pytest
 from reference.variants import BACKEND_IDS, BACKENDS
 
 from fus3dmaps_core.config.schema import MapConfig
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 SIZE_M = 0.5
@@ -57,7 +58,7 @@ def fused(semantic_map: SemanticMap, instance_id: int = 0) -> tuple[np.ndarray, 
 
 def cosines(semantic_map: SemanticMap, layer: str) -> dict[int, np.ndarray]:
     """Per voxel the cosines with x, y and z: the direction of its embedding."""
-    findings = [semantic_map.search(layer, axis[None]) for axis in np.eye(3, dtype=np.float32)]
+    findings = [semantic_map.search(LayerQuery(layer, axis[None])) for axis in np.eye(3, dtype=np.float32)]
     numbers = np.floor(findings[0].points_m[:, 0] / SIZE_M).astype(int)
     return dict(zip(numbers.tolist(), np.stack([finding.similarity for finding in findings], axis=1), strict=True))
 

@@ -15,9 +15,9 @@ import pytest
 import torch
 from reference.variants import BACKEND_IDS, BACKENDS, kernels_of
 
-from fus3dmaps_core.voxel_map.kernels.protocols import Pairs
+from fus3dmaps_core.voxel_map.kernels.protocols import GroupedCounts
 from fus3dmaps_core.voxel_map.rows.rounding import seeds_of
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 VOXELS = 64
 STEP = {"float16": 2.0**-11, "int8": 1 / 112}
@@ -38,7 +38,7 @@ class Means:
         self.pool = RowPool(width, getattr(torch, dtype), self._device)
         self._rows = self.pool.allocate(VOXELS)
         self._keys = torch.arange(VOXELS, device=self._device) * 2**21 + 5
-        self._groups = Pairs(
+        self._groups = GroupedCounts(
             torch.arange(VOXELS + 1, device=self._device),
             torch.zeros(VOXELS, dtype=torch.int64, device=self._device),
             torch.ones(VOXELS, dtype=torch.int64, device=self._device),

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from reference.variants import DEVICES, DTYPES
 
 from fus3dmaps_core.errors import MapError
-from fus3dmaps_core.voxel_map.rows import numbers
-from fus3dmaps_core.voxel_map.rows.rows import RowPool
+from fus3dmaps_core.voxel_map.rows import number_pool as numbers
+from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 BLOCK_ROWS = RowPool(1, torch.float32, torch.device("cpu")).block_rows
 

@@ -1,4 +1,4 @@
-"""Small integers that name slots and rows: given out from 0 upwards, and given again once they were given back."""
+"""Small integers that name slots and rows: handed out from 0 upwards, and reused once they are given back."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from fus3dmaps_core.voxel_map.rows.columns import Column
 _LIMIT = 2**31 - 1  # Numbers are held in 32-bit columns.
 
 
-class Numbers:
-    """Which numbers are in use."""
+class NumberPool:
+    """Keeps track of which numbers are in use."""
 
     def __init__(self, what: str, device: torch.device) -> None:
-        """None is in use; ``what`` they number is for messages."""
+        """Start with none in use; ``what`` says in error messages what they number."""
         self._what = what
         self._device = device
         self._high = 0
@@ -23,12 +23,12 @@ class Numbers:
         self._free_count = 0
 
     def __len__(self) -> int:
-        """How many are in use."""
+        """Return how many numbers are in use."""
         return self._high - self._free_count
 
     @property
     def high_water(self) -> int:
-        """One more than the largest ever given."""
+        """One more than the largest number ever handed out."""
         return self._high
 
     @property
@@ -36,13 +36,26 @@ class Numbers:
         """Allocated bytes."""
         return self._free.nbytes
 
+    @property
+    def row_nbytes(self) -> int:
+        """Bytes that a number takes once it is given back."""
+        return self._free.row_nbytes
+
+    def high_water_after(self, count: int) -> int:
+        """Return the ``high_water`` that there is once ``count`` more numbers are in use."""
+        return max(self._high, len(self) + count)
+
+    def nbytes_after(self, count: int) -> int:
+        """Return the most bytes that are allocated once ``count`` more numbers were in use and all were given back."""
+        return self._free.nbytes_after(self.high_water_after(count))
+
     def check_room(self, count: int) -> None:
-        """Raise MapError if ``count`` more would be more than 32 bits can tell apart."""
+        """Raise MapError if 32 bits cannot tell ``count`` more numbers apart."""
         if len(self) + count > _LIMIT:
             raise MapError(f"the map holds {len(self)} {self._what} and cannot number {count} more")
 
     def take(self, count: int) -> Tensor:
-        """Numbers not in use, those given back last first: (count,) int64.
+        """Hand out numbers that are not in use, those given back last first: (count,) int64.
 
         Raises:
             MapError: As :meth:`check_room`; none was taken.

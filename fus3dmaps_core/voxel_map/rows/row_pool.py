@@ -1,4 +1,4 @@
-"""Pooled storage of embedding rows in blocks of fixed size: it grows without copying and reuses what is freed."""
+"""Pooled storage of embedding rows in blocks of fixed size. It grows without copying and reuses freed rows."""
 
 from __future__ import annotations
 
@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from fus3dmaps_core.voxel_map.rows.columns import Column
-from fus3dmaps_core.voxel_map.rows.numbers import Numbers
+from fus3dmaps_core.voxel_map.rows.number_pool import NumberPool
 from fus3dmaps_core.voxel_map.rows.rounding import to_half, to_int8
 
 _BLOCK_ROWS = {"cpu": 1024, "cuda": 32768}  # A CPU visits blocks in cache-sized steps, a GPU wants few launches.
 _MOVED_ROWS = 1024
+_LEAST_ADDRESSES = 16
 
 
 def shortened(column: Column, count: int, fill: int | float) -> Column:
-    """A column of one value a row that takes no more than the first ``count`` rows of another need, and holds those."""
+    """Copy the first ``count`` rows of a column of one value a row into a new column that is no longer than needed."""
     kept = column[:count]
     short = Column(kept.dtype, fill, kept.device)
     short.reserve(count)
@@ -47,10 +48,10 @@ class RowPool:
         self.addresses: NDArray[np.int64] = np.zeros(0, np.int64)
         self.scales = Column(torch.float32, 0.0, device)
         self._device = device
-        self._numbers = Numbers("embeddings", device)
+        self._numbers = NumberPool("embeddings", device)
 
     def __len__(self) -> int:
-        """Number of rows in use."""
+        """Return the number of rows in use."""
         return len(self._numbers)
 
     @property
@@ -69,17 +70,42 @@ class RowPool:
         values = sum(block.numel() * block.element_size() for block in self.blocks)
         return values + self.addresses.nbytes + self.scales.nbytes + self._numbers.nbytes
 
+    @property
+    def block_nbytes(self) -> int:
+        """Most bytes that one more block takes, with columns that have just doubled."""
+        columns = 2 * (self._numbers.row_nbytes + (self.scales.row_nbytes if self.dtype == torch.int8 else 0))
+        return self.block_rows * (self._values_nbytes + columns) + _LEAST_ADDRESSES * self.addresses.itemsize
+
+    def high_water_after(self, count: int) -> int:
+        """Return the ``high_water`` that there is once ``count`` more rows are in use."""
+        return self._numbers.high_water_after(count)
+
+    def nbytes_after(self, count: int) -> int:
+        """Return the most bytes that are allocated once ``count`` more rows are in use, or were and are free again."""
+        rows = self.high_water_after(count)
+        blocks = max(len(self.blocks), -(-rows // self.block_rows))
+        addresses = len(self.addresses) if blocks <= len(self.addresses) else max(_LEAST_ADDRESSES, 2 * blocks)
+        scales = self.scales.nbytes_after(rows) if self.dtype == torch.int8 else self.scales.nbytes
+        values = blocks * self.block_rows * self._values_nbytes
+        return values + addresses * self.addresses.itemsize + scales + self._numbers.nbytes_after(count)
+
+    @property
+    def _values_nbytes(self) -> int:
+        return self.dimension * self.dtype.itemsize
+
     def check_room(self, count: int) -> None:
-        """Raise MapError if ``count`` more rows would be more than 32-bit row numbers can tell apart."""
+        """Raise MapError if 32-bit row numbers cannot tell ``count`` more rows apart."""
         self._numbers.check_room(count)
 
     def allocate(self, count: int) -> Tensor:
-        """Row numbers for ``count`` new rows, freed ones first: (count,) int64. Their content is undefined."""
+        """Hand out ``count`` rows, freed ones first: (count,) int64 row numbers. Their content is undefined."""
         rows = self._numbers.take(count)
         while self.high_water > len(self.blocks) * self.block_rows:
             block = torch.empty((self.block_rows, self.dimension), dtype=self.dtype, device=self._device)
             if len(self.blocks) == len(self.addresses):
-                self.addresses = np.concatenate([self.addresses, np.zeros(max(16, len(self.blocks)), np.int64)])
+                self.addresses = np.concatenate(
+                    [self.addresses, np.zeros(max(_LEAST_ADDRESSES, len(self.blocks)), np.int64)]
+                )
             self.addresses[len(self.blocks)] = block.data_ptr()
             self.blocks.append(block)
         if self.dtype == torch.int8:
@@ -87,7 +113,7 @@ class RowPool:
         return rows
 
     def free(self, rows: Tensor) -> None:
-        """Give rows back; each must be in use and appear once."""
+        """Take rows back; each must be in use and appear once."""
         self._numbers.give_back(rows)
 
     def move(self, sources: Tensor, targets: Tensor) -> None:
@@ -96,8 +122,8 @@ class RowPool:
             self.write_stored(places, *self.read_stored(some))
 
     def truncate(self, count: int) -> None:
-        """Have rows 0 .. count - 1 in use and no others, and give back the blocks and columns beyond them."""
-        self._numbers = Numbers("embeddings", self._device)
+        """Declare rows 0 .. count - 1 in use and no others, and free the blocks and columns beyond them."""
+        self._numbers = NumberPool("embeddings", self._device)
         self._numbers.take(count)
         del self.blocks[-(-count // self.block_rows) :]
         self.addresses[len(self.blocks) :] = 0
@@ -105,13 +131,13 @@ class RowPool:
             self.scales = shortened(self.scales, count, 0.0)
 
     def read(self, rows: Tensor) -> Tensor:
-        """Values of the rows: (n, d) float32."""
+        """Return the values of the rows: (n, d) float32."""
         stored, scales = self.read_stored(rows)
         values = stored.to(torch.float32)
         return values.mul_(scales[:, None]) if self.dtype == torch.int8 else values
 
     def read_stored(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Values as they are stored, (n, d), and the rows' scales, (n,) float32 (without int8: none)."""
+        """Return the values as they are stored, (n, d), and for int8 the rows' scales, (n,) float32."""
         stored = torch.empty((len(rows), self.dimension), dtype=self.dtype, device=self._device)
         for block, where in self._by_block(rows):
             within = rows.index_select(0, where) - block * self.block_rows

@@ -1,13 +1,13 @@
-"""A question to a layer of the map: passes over all voxels, in memory that does not follow the size of the map.
+"""Passes over all voxels of the map that answer a query, in memory that does not grow with the map.
 
-Voxels are looked at block by block, and only the answer is kept: 16 bytes for each voxel of it, 20 with its label, and a few
-sums for each instance and prompt. Where there are so many of both that the sums would be large, prompts are taken some at a
-time, and what was best so far is kept.
+Voxels are scanned block by block, and only the answer is kept: 16 bytes for each of its voxels, 20 with a label, and a few
+sums for each instance and prompt. Where there are so many instances and prompts that the sums would be large, the map is
+scanned several times, each time for some of the prompts, and the best scores so far are kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import NamedTuple
 
@@ -16,19 +16,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.voxel_map.kernels.protocols import (
     SCORE_UNIT,
-    EmbeddedLayer,
     Extents,
-    InheritedLayer,
-    Kernels,
     ScoredVoxels,
     ScoreSums,
     SlotBlock,
     Texts,
 )
-from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
+from fus3dmaps_core.voxel_map.layers.fusion import FusionInputs
+from fus3dmaps_core.voxel_map.layers.similarity import layer_named
 from fus3dmaps_core.voxel_map.snapshots import InstanceSnapshot, snapshot_instances
 from fus3dmaps_core.voxel_map.state import MapState
 
@@ -39,25 +37,8 @@ _NEVER = -(2**63)
 
 
 @dataclass(frozen=True)
-class Question:
-    """What is asked of a layer.
-
-    Attributes:
-        texts: Prompts, what they are compared against, and the logit scale.
-        threshold: Voxels with a lower score are left out; None leaves none out.
-        top_k: At most this many instances per prompt.
-        min_voxels: Instances that occupy fewer voxels are not ranked.
-    """
-
-    texts: Texts
-    threshold: float | None
-    top_k: int
-    min_voxels: int
-
-
-@dataclass(frozen=True)
 class Finding:
-    """What a layer answers.
+    """The answer of a layer to a query.
 
     Attributes:
         voxels: How many voxels have the layer.
@@ -96,70 +77,46 @@ class Labelling:
     instance_scores: NDArray[np.float64]
 
 
-LayerOf = Callable[[Texts], EmbeddedLayer | InheritedLayer]
-"""Makes the layer that is asked, compared with some of the prompts and all negatives."""
-
-
-def unit_texts(layer: str, given: dict[str, NDArray[np.floating]], unit: Callable[..., Tensor]) -> list[Tensor]:
-    """What a layer is to be compared with, by argument, as unit vectors (n, d) float32.
-
-    Args:
-        layer: Name of the layer.
-        given: Text embeddings by the name of the argument; of the first, one is needed.
-        unit: Scales those of an argument, given its name and them.
-
-    Raises:
-        QueryError: The layer is unknown, or there is no text.
-        MapError: From ``unit``.
-    """
-    if layer not in LAYERS:
-        raise QueryError(f"unknown layer '{layer}', known are {', '.join(LAYERS)}")
-    vectors = [unit(name, embeddings) for name, embeddings in given.items()]
-    if not len(vectors[0]):
-        name = next(iter(given))
-        raise QueryError(f"{name}: at least one {name.removesuffix('s')} is needed")
-    return vectors
-
-
 class _Pass(NamedTuple):
-    """What a pass over the map found for some of the prompts: the place of the first one, their sums, and extents."""
+    """The result of a pass for some of the prompts: the place of the first one, their sums, and extents of instances."""
 
     first: int
     sums: ScoreSums
     extents: Extents
 
 
-class Survey:
-    """Passes over the voxels of a map that nobody changes meanwhile."""
+class MapScan:
+    """Passes over the voxels of a map, which must not change meanwhile."""
 
-    def __init__(self, state: MapState, kernels: Kernels, voxel_size_m: float) -> None:
-        """Of a map's content."""
-        self._state, self._kernels, self._voxel_size_m = state, kernels, voxel_size_m
+    def __init__(self, state: MapState, fusion: FusionInputs, voxel_size_m: float) -> None:
+        """Prepare to scan the content of a map, whose layers are fused as ``fusion`` says."""
+        self._state, self._fusion, self._voxel_size_m = state, fusion, voxel_size_m
+        self._kernels = fusion.kernels
         self._ids, self._rows = state.instances.live()
         self._device = self._rows.device
 
     def instances(self) -> InstanceSnapshot:
-        """All instances alive and what they occupy."""
+        """Return all instances alive and what they occupy."""
         extents = self._state.instances.extents()
         nowhere = ScoredVoxels(torch.empty((0, 3)), torch.empty(0))
         for block in self._blocks(0):
             self._kernels.scan(block, self._state.instances.columns(), extents, None, None, -np.inf, nowhere)
         return self._snapshot(extents)
 
-    def search(self, layer_of: LayerOf, question: Question) -> Finding:
-        """Answer a question."""
-        threshold = -np.inf if question.threshold is None else question.threshold
+    def search(self, query: LayerQuery, texts: Texts) -> Finding:
+        """Answer a query, whose prompts and negatives are given as unit vectors."""
+        threshold = -np.inf if query.threshold is None else query.threshold
         answer = _Answer(self._state.hash.high_water, threshold, self._device)
         best: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
-        for done in self._passes(layer_of, question.texts, answer):
-            best += self._ranked(done.sums, done.extents, question)
+        for done in self._passes(query.layer, texts, answer):
+            best += self._ranked(done.sums, done.extents, query)
         points_m, similarity = answer.voxels()
         return Finding(answer.found, points_m, similarity, self._snapshot(done.extents), best)
 
-    def label(self, layer_of: LayerOf, vectors: Tensor) -> Labelling:
-        """Which of some unit vectors (p, d), at least one, is the most similar to each voxel and instance.
+    def label(self, layer: str, vectors: Tensor) -> Labelling:
+        """Find which of some unit vectors (p, d), at least one, is the most similar to each voxel and instance.
 
-        Equal vectors are asked once, so that rounding, which depends on a text's place, does not choose among them.
+        Equal vectors are compared once, so that rounding, which depends on a text's place, does not choose among them.
         """
         first_of: dict[bytes, int] = {}
         for place, vector in enumerate(vectors.cpu().numpy()):
@@ -169,7 +126,7 @@ class Survey:
         answer = _Answer(self._state.hash.high_water, -np.inf, self._device, with_labels=True)
         most = torch.full((len(self._rows),), _NEVER, dtype=torch.int64, device=self._device)
         text = torch.zeros_like(most)
-        for done in self._passes(layer_of, Texts(distinct, len(distinct), 1.0), answer):
+        for done in self._passes(layer, Texts(distinct, len(distinct), 1.0), answer):
             highest, which = _highest(done.sums.totals, self._rows)
             text = torch.where(highest > most, which + done.first, text)
             most = torch.maximum(highest, most)
@@ -182,8 +139,8 @@ class Survey:
                 labels[block : block + _BLOCK_VOXELS] = place_of_text[labels[block : block + _BLOCK_VOXELS]]
         return Labelling(points_m, labels, scores, self._snapshot(done.extents), of_instances, means)
 
-    def _passes(self, layer_of: LayerOf, texts: Texts, answer: _Answer) -> Iterator[_Pass]:
-        """Pass over the map for some of the prompts at a time, and write the answer."""
+    def _passes(self, layer: str, texts: Texts, answer: _Answer) -> Iterator[_Pass]:
+        """Scan the map for some of the prompts at a time, and write the answer."""
         instance_rows, begin = self._state.instances.pool.high_water, 0
         prompts, negatives = texts.vectors[: texts.prompts], texts.vectors[texts.prompts :]
         # The sum itself, in an instance layer the instance's own score, and what threads have added up so far.
@@ -195,12 +152,12 @@ class Survey:
                 torch.zeros(instance_rows, dtype=torch.int64, device=self._device),
                 torch.zeros((instance_rows, len(group)), dtype=torch.int64, device=self._device),
             )
-            extents, layer = self._state.instances.extents(), layer_of(few)
+            extents, compared = self._state.instances.extents(), layer_named(layer, self._fusion, self._state.fused, few)
             answer.begin(number + 1, len(groups), begin)
             for block in self._blocks(len(few.vectors)):
                 room = answer.room(len(block.keys))
                 columns = self._state.instances.columns()
-                answer.take(*self._kernels.scan(block, columns, extents, layer, sums, answer.least, room), room)
+                answer.take(*self._kernels.scan(block, columns, extents, compared, sums, answer.least, room), room)
             yield _Pass(begin, sums, extents)
             begin += len(group)
 
@@ -217,24 +174,24 @@ class Survey:
         return snapshot_instances(self._ids, weights, hypotheses, of_rows, self._voxel_size_m)
 
     def _ranked(
-        self, sums: ScoreSums, extents: Extents, question: Question
+        self, sums: ScoreSums, extents: Extents, query: LayerQuery
     ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """For each prompt the places of the best instances, by ascending id, and their mean scores."""
+        """Yield for each prompt the places of the best instances and their mean scores."""
         members, voxels = sums.members.index_select(0, self._rows), extents.voxels.index_select(0, self._rows)
-        rankable = torch.nonzero((members > 0) & (voxels >= question.min_voxels)).squeeze(1)
+        rankable = torch.nonzero((members > 0) & (voxels >= query.min_voxels)).squeeze(1)
         rows, counts = self._rows.index_select(0, rankable), members.index_select(0, rankable).cpu().numpy()
         places = rankable.cpu().numpy()
         for totals in sums.totals.unbind(1):
             means = totals.index_select(0, rows).cpu().numpy() / (SCORE_UNIT * counts.astype(np.float64))
-            chosen = _largest(means, question.top_k)
+            chosen = _largest(means, query.top_k)
             yield places[chosen], means[chosen]
 
 
 class _Answer:
-    """Voxels of an answer as they come; each pass over the map, for some of the prompts, brings the same ones."""
+    """Collects the voxels of an answer. Each pass over the map, for some of the prompts, brings the same voxels."""
 
     def __init__(self, slots: int, threshold: float, device: torch.device, with_labels: bool = False) -> None:
-        """For a map whose voxels are in so many slots; with labels that say which prompt is best."""
+        """Start for a map with so many slots; with labels, remember which prompt is best."""
         self._threshold, self._device = threshold, device
         # As large as the answer can become; pages that are never written are never real.
         self._points_m, self._best = np.empty((slots, 3), np.float32), np.empty(slots, np.float32)
@@ -242,16 +199,16 @@ class _Answer:
         self._first, self._first_prompt = True, 0
         self.kept = self.found = 0
         self.least = -np.inf
-        """Scores of voxels that a pass can leave out at once are below this."""
+        """A pass can leave out voxels with a score below this."""
 
     def begin(self, number: int, passes: int, first_prompt: int) -> None:
-        """Before a pass, counted from 1, for prompts from this one on."""
+        """Begin a pass, counted from 1, for prompts from this one on."""
         self._first, self._first_prompt = number == 1, first_prompt
         self.kept = self.found = 0
         self.least = self._threshold if passes == 1 else -np.inf
 
     def room(self, length: int) -> ScoredVoxels:
-        """Where the next block's voxels go."""
+        """Return the room that the next block's voxels are written to."""
         if self._first and self._device.type == "cpu":
             here = slice(self.kept, self.kept + length)
             which = None if self._labels is None else torch.from_numpy(self._labels[here])
@@ -260,7 +217,7 @@ class _Answer:
         return ScoredVoxels(torch.empty((length, 3), device=self._device), torch.empty(length, device=self._device), which)
 
     def take(self, found: int, count: int, room: ScoredVoxels) -> None:
-        """Take ``count`` voxels that were written into the room, of ``found`` that have the layer."""
+        """Take over ``count`` voxels that were written into the room, of ``found`` that have the layer."""
         here = slice(self.kept, self.kept + count)
         if not self._first:
             best = room.best[:count].cpu().numpy()
@@ -276,11 +233,11 @@ class _Answer:
         self.found += found
 
     def labels(self) -> NDArray[np.int32]:
-        """Of an answer with labels and without a threshold: which prompt is best for each voxel, of equal ones the first."""
+        """Return which prompt is best for each voxel, of equal ones the first; needs labels and no threshold."""
         return np.empty(0, np.int32) if self._labels is None else self._labels[: self.kept]
 
     def voxels(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Centres and scores of the voxels that reach the threshold."""
+        """Return centres and scores of the voxels that reach the threshold."""
         points_m, best = self._points_m[: self.kept], self._best[: self.kept]
         if self.least >= self._threshold:
             return points_m, best
@@ -295,7 +252,7 @@ class _Answer:
 
 
 def _highest(totals: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """The largest of each of some rows of sums (rows, p), and which it is, of equal ones the first: (n,) int64."""
+    """Find the largest of each of some rows of sums (rows, p), and which it is, of equal ones the first: (n,) int64."""
     most, which = [totals.new_zeros(0)], [totals.new_zeros(0)]
     for some in torch.split(rows, max(1, _BLOCK_SUMS // totals.shape[1])):
         highest = totals.index_select(0, some).max(dim=1)

@@ -10,7 +10,8 @@ from reference.agreement import engine_of
 from reference.steps import Setting, embeddings_of, random_steps
 from reference.variants import BACKEND_IDS, BACKENDS
 
-from fus3dmaps_core.voxel_map import search
+from fus3dmaps_core.voxel_map import map_scan
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
@@ -36,10 +37,10 @@ def test_prompts_in_groups_answer_as_all_at_once(backend: str, device: str, laye
             "prompts": embeddings_of(7, setting.dimension, rng),
             "negatives": embeddings_of(negatives, setting.dimension, rng) if negatives else None,
         }
-        together = engine.search(layer, **given_texts, logit_scale=3.0, threshold=threshold)
+        together = engine.search(LayerQuery(layer, **given_texts, logit_scale=3.0, threshold=threshold))
         with monkeypatch.context() as patched:
-            patched.setattr(search, "_SUM_BYTES", 1)  # One prompt at a time.
-            apart = engine.search(layer, **given_texts, logit_scale=3.0, threshold=threshold)
+            patched.setattr(map_scan, "_SUM_BYTES", 1)  # One prompt at a time.
+            apart = engine.search(LayerQuery(layer, **given_texts, logit_scale=3.0, threshold=threshold))
         assert apart.voxels == together.voxels
         sizes = {len(apart.points_m), len(apart.similarity)}
         assert len(sizes) == 1
@@ -60,4 +61,4 @@ def test_prompts_in_groups_answer_as_all_at_once(backend: str, device: str, laye
 @given(st.lists(st.integers(0, 5), max_size=30), st.integers(1, 40))
 def test_the_largest_come_first_and_equal_ones_in_their_order(values: list[int], count: int):
     expected = sorted(range(len(values)), key=lambda place: (-values[place], place))[:count]
-    assert search._largest(np.array(values, np.float64), count).tolist() == expected
+    assert map_scan._largest(np.array(values, np.float64), count).tolist() == expected

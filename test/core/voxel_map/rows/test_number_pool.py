@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fus3dmaps_core.voxel_map.rows.numbers import Numbers
+from fus3dmaps_core.voxel_map.rows.number_pool import NumberPool
 
 _actions = st.lists(st.one_of(st.integers(0, 60), st.floats(0.0, 1.0)), max_size=20)
 
@@ -15,7 +15,7 @@ _actions = st.lists(st.one_of(st.integers(0, 60), st.floats(0.0, 1.0)), max_size
 @given(_actions, st.integers(0, 2**32 - 1))
 def test_numbers_in_use_are_distinct_and_as_small_as_the_most_that_were(actions, seed: int):
     rng = np.random.default_rng(seed)
-    numbers, used, most = Numbers("things", torch.device("cpu")), set(), 0
+    numbers, used, most = NumberPool("things", torch.device("cpu")), set(), 0
     freed: list[int] = []
     for action in actions:
         if isinstance(action, int):
