@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable
@@ -10,7 +11,6 @@ from pathlib import Path
 
 from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.saved_maps.storage import MapInfo
 from fus3dmaps_core.sources.bag import BagSource
 from fus3dmaps_core.sources.pairing import PairedMessages
 
@@ -45,7 +45,9 @@ class RunSummary:
         return self.dense_keyframes / self.duration_s if self.duration_s else 0.0
 
 
-def map_recording(path: Path, pipeline: Pipeline, on_progress: Callable[[int, int], None] | None = None) -> RunSummary:
+def map_recording(
+    path: str | os.PathLike[str], pipeline: Pipeline, on_progress: Callable[[int, int], None] | None = None
+) -> RunSummary:
     """Map a recording and fuse the layers at its end.
 
     Args:
@@ -59,7 +61,7 @@ def map_recording(path: Path, pipeline: Pipeline, on_progress: Callable[[int, in
     """
     summary = RunSummary()
     started = time.perf_counter()
-    with BagSource(path, pipeline.config.input) as source:
+    with BagSource(Path(path), pipeline.config.input) as source:
         try:
             for paired in source:
                 summary.frames += 1
@@ -96,15 +98,3 @@ def _process(paired: PairedMessages, pipeline: Pipeline, summary: RunSummary) ->
     summary.proposals += report.proposals
     for stage, seconds in report.durations_s.items():
         summary.stages_s[stage] += seconds
-
-
-def map_info(pipeline: Pipeline) -> MapInfo:
-    """What a map file is to say of a pipeline's map."""
-    return MapInfo(
-        pipeline.trio.name,
-        pipeline.trio.logit_scale,
-        pipeline.config.input.map_frame,
-        pipeline.stamp_ns,
-        pipeline.config,
-        pipeline.camera_poses(),
-    )

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fus3dmaps_core.answers.query import QueryAnswer, TextQuery, answer_query
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.encoders.batching import Batches, naming_out_of_memory
 from fus3dmaps_core.encoders.mask_pooling import pool_masks
@@ -22,6 +24,7 @@ from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sampl
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.runtimes.acceleration import accelerate
 from fus3dmaps_core.runtimes.image_memory import naming_image_size
+from fus3dmaps_core.saved_maps.storage import MapInfo
 from fus3dmaps_core.segmenters.filtering import filter_masks
 from fus3dmaps_core.segmenters.protocols import Segmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
@@ -32,7 +35,7 @@ from fus3dmaps_core.voxel_map.warm_up import warm_up
 
 @dataclass
 class FrameReport:
-    """What became of a frame.
+    """The result of processing a frame.
 
     Attributes:
         stamp_ns: Time of the frame, nanoseconds.
@@ -74,40 +77,30 @@ class Pipeline:
     """
 
     def __init__(self, config: Config, trio: EncoderTrio, segmenter: Segmenter) -> None:
-        """Start with an empty map; ``fusion.variance_ratio`` of 0 takes that of the encoders that describe it."""
+        """Start with an empty map; ``fusion.variance_ratio`` of 0 takes that of the encoders."""
         self.config = config
         self.trio = trio
         self._segmenter = segmenter
-        self.semantic_map = SemanticMap(
-            trio.dimension,
-            config.map,
-            _variance_ratio(config, trio),
-            config.fusion.window_radius_m,
-            config.fusion.keep_most_evidence,
-            trio.name,
-        )
-        gates = config.keyframes
-        self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
-        self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
         self._crop_batches = Batches(f"crop encoder of '{trio.name}'")
-        self._budget = MemoryBudget(
-            config.map.memory_budget_mib,
-            config.fusion.window_radius_m,
-            config.map.voxel_size_m,
-            _keyframe_bound(config, trio),
-        )
+        self.semantic_map = self.empty_map()
+        self._make_gates()
+        self._make_budget()
         self._processed = 0
         self.stamp_ns = 0
         self._camera_poses: list[NDArray[np.float64]] = []
 
     @classmethod
-    def from_config(cls, config: Config) -> Pipeline:
+    def from_config(cls, config: Config | None = None) -> Pipeline:
         """Load the encoders and the segmenter that the configuration names, and warm up the map.
+
+        Args:
+            config: None takes the defaults.
 
         Raises:
             EncoderError: One of them is unknown, its packages or weights are missing or altered, or the runtime cannot be
                 used.
         """
+        config = config or Config()
         encoder = config.encoder
         segmenter = load_segmenter(config.segmenter.name, encoder, config.segmenter.weights)
         trio = load_trio(encoder.name, encoder.device, config.segmenter.crop_padding, encoder.weights)
@@ -117,8 +110,36 @@ class Pipeline:
         return cls(config, trio, segmenter)
 
     def wants(self, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether a frame with this pose would be a keyframe of either layer; changes nothing."""
+        """Tell whether a frame with this pose would be a keyframe of either layer; changes nothing."""
         return self._dense_gate.wants(T_world_camera) or self._instance_gate.wants(T_world_camera)
+
+    def ask(self, prompts: str | Sequence[str] | TextQuery, **options: Any) -> QueryAnswer:
+        """Answer a query in words, e.g. ``pipeline.ask("a mug", top_k=3)``. The map is not changed.
+
+        Args:
+            prompts: What to look for: a prompt, several, or a whole query.
+            **options: Other attributes of :class:`TextQuery`, by name.
+
+        Raises:
+            QueryError: The query is malformed, or the map or the layer is empty.
+        """
+        return answer_query(self.semantic_map, self.trio.text, TextQuery.of(prompts, **options), self.trio.logit_scale)
+
+    @property
+    def info(self) -> MapInfo:
+        """What a saved map tells besides the map."""
+        return MapInfo(
+            self.trio.name,
+            self.trio.logit_scale,
+            self.config.input.map_frame,
+            self.stamp_ns,
+            self.config,
+            self.camera_poses(),
+        )
+
+    def __repr__(self) -> str:
+        """Say how much is mapped and by which encoders."""
+        return f"Pipeline({len(self._camera_poses):,} keyframes, {self.semantic_map!r})"
 
     def process(self, frame: PosedFrame) -> FrameReport:
         """Integrate a frame, if it is a keyframe of one of the layers [sec: Implementation Details].
@@ -169,7 +190,7 @@ class Pipeline:
         self._camera_poses.clear()
 
     def camera_poses(self) -> NDArray[np.float64]:
-        """Poses T_world_camera of the keyframes so far: (n, 4, 4)."""
+        """Return the poses T_world_camera of the keyframes so far: (n, 4, 4)."""
         return np.array(list(self._camera_poses), dtype=np.float64).reshape(-1, 4, 4)
 
     def _encode_patches(self, working: WorkingFrame, report: FrameReport) -> PatchEmbeddings:
@@ -225,7 +246,7 @@ class Pipeline:
     def _proposal_samples(
         self, working: WorkingFrame, masks: Masks
     ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Masks]:
-        """Which sampled pixels with depth lie inside each mask.
+        """Find the sampled pixels with depth that lie inside each mask.
 
         Returns:
             Proposal and sample, two (n,) int64, of each sample inside a mask; row and column, two (q,) int64, of all
@@ -242,21 +263,16 @@ class Pipeline:
         return proposals, samples, ys, xs, masks.take(seen)
 
     def empty_map(self) -> SemanticMap:
-        """Another map like this pipeline's, with nothing in it."""
-        return SemanticMap(
-            self.trio.dimension,
-            self.config.map,
-            _variance_ratio(self.config, self.trio),
-            self.config.fusion.window_radius_m,
-            self.config.fusion.keep_most_evidence,
-            self.trio.name,
-        )
+        """Make another map like this pipeline's, with nothing in it."""
+        # Where patches describe both layers, the errors of both have the same variance.
+        ratio = 1.0 if self.config.encoder.instance_embeddings == "patches" else self.trio.variance_ratio
+        return SemanticMap.from_config(self.config, self.trio.dimension, ratio, self.trio.name)
 
     def restore(self, semantic_map: SemanticMap, stamp_ns: int, camera_poses: NDArray[np.float64]) -> None:
-        """Go on from another map; the next frame is a keyframe of both layers.
+        """Go on from another map. The next frame is a keyframe of both layers.
 
         Args:
-            semantic_map: Takes the place of the pipeline's; made by :meth:`empty_map`, whatever was put into it since.
+            semantic_map: Replaces the pipeline's; made by :meth:`empty_map` and filled since.
             stamp_ns: Time of its newest keyframe, nanoseconds.
             camera_poses: (n, 4, 4) T_world_camera of its keyframes.
         """
@@ -268,10 +284,10 @@ class Pipeline:
         self.semantic_map = semantic_map
 
     def reconfigure(self, config: Config) -> None:
-        """Take over what of a configuration a running pipeline can change; the map and the models stay.
+        """Take over the part of a configuration that a running pipeline can change; the map and the models stay.
 
-        That is how keyframes are chosen, masks filtered and windows fused, and the memory budget. With other thresholds of
-        motion the next frame is a keyframe.
+        That part says how keyframes are chosen, masks filtered and windows fused, and how much memory there is. With other
+        thresholds of motion the next frame is a keyframe.
 
         Args:
             config: Sections ``encoder`` and ``sampling``, and the map's own properties, must be those of the present one.
@@ -279,29 +295,24 @@ class Pipeline:
         gates_changed = config.keyframes != self.config.keyframes
         self.config = config
         if gates_changed:
-            gates = config.keyframes
-            self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
-            self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
-        self._budget = MemoryBudget(
-            config.map.memory_budget_mib,
-            config.fusion.window_radius_m,
-            config.map.voxel_size_m,
-            _keyframe_bound(config, self.trio),
-        )
+            self._make_gates()
+        self._make_budget()
         if not config.map.memory_budget_mib and config.fusion.window_radius_m > 0:
             self.semantic_map.set_window_radius(config.fusion.window_radius_m)  # Nothing else would widen it again.
 
+    def _make_gates(self) -> None:
+        gates = self.config.keyframes
+        self._dense_gate = KeyframeGate(gates.dense_translation_m, gates.dense_rotation_rad)
+        self._instance_gate = KeyframeGate(gates.instance_translation_m, gates.instance_rotation_rad)
 
-def _variance_ratio(config: Config, trio: EncoderTrio) -> float:
-    """Lambda as configured, or that of the encoders; where one encoder describes both layers, its errors are the same."""
-    of_encoders = 1.0 if config.encoder.instance_embeddings == "patches" else trio.variance_ratio
-    return config.fusion.variance_ratio or of_encoders
-
-
-def _keyframe_bound(config: Config, trio: EncoderTrio) -> KeyframeBound:
-    """The most that a keyframe can add: each of its samples in a voxel of its own, each mask a new instance."""
-    rows, columns = trio.patch.grid(config.image.height, config.image.width)
-    dense, instances = (
-        rows * columns * samples for samples in (config.sampling.dense_per_patch, config.sampling.instance_per_patch)
-    )
-    return KeyframeBound(dense + instances, dense, config.segmenter.max_masks)
+    def _make_budget(self) -> None:
+        config = self.config
+        rows, columns = self.trio.patch.grid(config.image.height, config.image.width)
+        dense, instances = (
+            rows * columns * samples for samples in (config.sampling.dense_per_patch, config.sampling.instance_per_patch)
+        )
+        # The most that a keyframe can add: each of its samples in a voxel of its own, each mask a new instance.
+        bound = KeyframeBound(dense + instances, dense, config.segmenter.max_masks)
+        self._budget = MemoryBudget(
+            config.map.memory_budget_mib, config.fusion.window_radius_m, config.map.voxel_size_m, bound
+        )

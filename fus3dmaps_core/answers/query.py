@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from fus3dmaps_core.voxel_map.snapshots import InstanceSnapshot
 
 DEFAULT_LAYER = "fused_instances"
 IMAGE_PROMPT = "image"
-"""What answers to an image have in the place of a prompt."""
+"""Stands in the place of the prompt in answers to an image."""
 
 _MIN_IMAGE_PX = 8
 _MAX_PROMPT_LENGTH = 4096
@@ -47,8 +48,25 @@ class TextQuery:
     top_k: int = 5
     min_voxels: int = 4
 
+    @classmethod
+    def of(cls, prompts: str | Sequence[str] | TextQuery, **options: Any) -> TextQuery:
+        """Make a query of one prompt, of several, or return the query that is given.
+
+        Args:
+            prompts: What to look for.
+            **options: Other attributes of the query, by name.
+        """
+        if isinstance(prompts, TextQuery):
+            return replace(prompts, **options)
+        return cls([prompts] if isinstance(prompts, str) else list(prompts), **options)
+
+    def in_embeddings(self, prompts: NDArray[np.float32], negatives: NDArray[np.float32], logit_scale: float) -> LayerQuery:
+        """Replace the words by their embeddings: (p, d) of the prompts, (q, d) of the negative prompts."""
+        given = negatives if len(negatives) else None
+        return LayerQuery(self.layer, prompts, given, logit_scale, self.threshold, self.top_k, self.min_voxels)
+
     def check(self) -> None:
-        """Raise QueryError, naming the field, unless the query can be asked of a map."""
+        """Raise QueryError, naming the field, unless the query can be put to a map."""
         if not self.prompts:
             raise QueryError("prompts: at least one prompt is needed")
         check_texts("prompts", self.prompts)
@@ -88,7 +106,7 @@ def check_space(semantic_map: SemanticMap, text_encoder: TextEncoder) -> None:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class RankedInstance:
     """An instance as the answer to a prompt.
 
@@ -112,8 +130,19 @@ class RankedInstance:
     box_max_m: NDArray[np.float32]
     voxels: int
 
+    def __repr__(self) -> str:
+        """Say in one line what was found where."""
+        return f"RankedInstance({self.prompt!r}: {self.line()})"
 
-@dataclass(frozen=True)
+    def line(self) -> str:
+        """Describe the instance in one line: score, position and size in metres, voxels, id."""
+        x, y, z = self.centroid_m.tolist()
+        width, depth, height = (self.box_max_m - self.box_min_m).tolist()
+        place, size = f"at ({x:.2f}, {y:.2f}, {z:.2f}) m", f"{width:.2f} x {depth:.2f} x {height:.2f} m"
+        return f"score {self.score:.3f} {place}, {size}, {self.voxels} voxels, id {self.id}"
+
+
+@dataclass(frozen=True, repr=False)
 class QueryAnswer:
     """Similarities of a layer and the best instances.
 
@@ -128,6 +157,12 @@ class QueryAnswer:
     points_m: NDArray[np.float32]
     similarity: NDArray[np.float32]
     instances: list[RankedInstance]
+
+    def __repr__(self) -> str:
+        """List the instances, one a line, below what was compared."""
+        head = f"QueryAnswer: {len(self.instances)} instances by {len(self.points_m):,} voxels of layer '{self.layer}'"
+        lines = (f"{place:3}. {found.prompt}: {found.line()}" for place, found in enumerate(self.instances, start=1))
+        return "\n".join([head, *lines])
 
 
 def answer_query(semantic_map: SemanticMap, text_encoder: TextEncoder, query: TextQuery, logit_scale: float) -> QueryAnswer:
@@ -205,16 +240,7 @@ def _answer(
     negative: NDArray[np.float32],
     logit_scale: float,
 ) -> QueryAnswer:
-    asked = LayerQuery(
-        query.layer,
-        positive,
-        negative if len(negative) else None,
-        logit_scale,
-        query.threshold,
-        query.top_k,
-        query.min_voxels,
-    )
-    found = semantic_map.search(asked)
+    found = semantic_map.search(query.in_embeddings(positive, negative, logit_scale))
     if not found.voxels:
         raise QueryError(f"layer: '{query.layer}' is empty in this map")
     return QueryAnswer(query.layer, found.points_m, found.similarity, _ranked(query, found))

@@ -7,16 +7,22 @@ manifest holds the SHA-256 of every array; nothing in it is ever unpickled. ``do
 from __future__ import annotations
 
 import logging
+import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from fus3dmaps_core.answers.query import QueryAnswer, TextQuery, answer_query
 from fus3dmaps_core.config.schema import Config, MapConfig
+from fus3dmaps_core.encoders.protocols import TextEncoder
+from fus3dmaps_core.encoders.registry import load_text_encoder
 from fus3dmaps_core.errors import ConfigError, MapError, StorageError
 from fus3dmaps_core.saved_maps.files import commit, is_own_name, opened, read_array, write_array, writing_to
 from fus3dmaps_core.saved_maps.manifest import FORMAT_VERSION, MANIFEST, Manifest, read_manifest
@@ -25,6 +31,8 @@ from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 __all__ = [
     "FORMAT_VERSION",
     "MapInfo",
+    "Savable",
+    "SavedMap",
     "check_fits",
     "check_map_target",
     "load_map",
@@ -41,7 +49,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class MapInfo:
-    """What a map file tells besides the map.
+    """What a saved map tells besides the map.
 
     Attributes:
         encoder: Registry name of the encoder trio whose space the embeddings live in.
@@ -58,6 +66,55 @@ class MapInfo:
     stamp_ns: int
     config: Config
     camera_poses: NDArray[np.float64]
+
+
+class Savable(Protocol):
+    """A map that can be saved: a pipeline, or what :func:`load_map` returns."""
+
+    @property
+    def semantic_map(self) -> SemanticMap:
+        """The map."""
+        ...
+
+    @property
+    def info(self) -> MapInfo:
+        """What is to be known besides."""
+        ...
+
+
+class SavedMap(NamedTuple):
+    """A map that was read from a directory.
+
+    Attributes:
+        semantic_map: The map.
+        info: What the saved map tells besides.
+    """
+
+    semantic_map: SemanticMap
+    info: MapInfo
+
+    def ask(self, prompts: str | Sequence[str] | TextQuery, **options: Any) -> QueryAnswer:
+        """Answer a query in words, e.g. ``load_map("kitchen").ask("a mug", top_k=3)``. Loads the text encoder once.
+
+        Args:
+            prompts: What to look for: a prompt, several, or a whole query.
+            **options: Other attributes of :class:`TextQuery`, by name.
+
+        Raises:
+            QueryError: The query is malformed, or the map or the layer is empty.
+            EncoderError: The text encoder cannot be loaded here.
+        """
+        encoder = _text_encoder(self.info.encoder, self.info.config.encoder.weights)
+        return answer_query(self.semantic_map, encoder, TextQuery.of(prompts, **options), self.info.logit_scale)
+
+    def __repr__(self) -> str:
+        """Say how much the map holds and where it comes from."""
+        return f"SavedMap({len(self.info.camera_poses):,} keyframes in frame '{self.info.map_frame}', {self.semantic_map!r})"
+
+
+@lru_cache(maxsize=2)
+def _text_encoder(name: str, weights: str) -> TextEncoder:
+    return load_text_encoder(name, "cpu", weights)
 
 
 def check_map_target(directory: Path) -> None:
@@ -86,7 +143,7 @@ def check_map_target(directory: Path) -> None:
         raise StorageError(f"'{directory}' exists and is not a saved map; it is left as it is")
 
 
-def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo, saved_ns: int | None = None) -> int:
+def save_map(directory: str | os.PathLike[str], saved: Savable, saved_ns: int | None = None) -> int:
     """Write a map, replacing a map that is there.
 
     The map is copied at one moment, under its lock, and goes on changing while the copy is written. Beside that copy a save
@@ -94,8 +151,7 @@ def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo, saved_ns
 
     Args:
         directory: Where; it and its parents are made. Until the save is complete it holds what it held.
-        semantic_map: The map.
-        info: What else is to be known of it.
+        saved: The map and what else is to be known of it, e.g. a pipeline.
         saved_ns: Time of the save, nanoseconds since 1970, by which maps are ordered; None takes the system's clock.
 
     Returns:
@@ -105,6 +161,8 @@ def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo, saved_ns
         StorageError: The place holds something that is not a map, cannot be written, or is being saved to by another
             process or thread; what was there is still there, and nothing else.
     """
+    # Read before the map is copied: what is saved may be newer than its stamp, never older.
+    directory, info, semantic_map = Path(directory), saved.info, saved.semantic_map
     check_map_target(directory)
     try:
         with writing_to(directory):
@@ -128,7 +186,7 @@ def save_map(directory: Path, semantic_map: SemanticMap, info: MapInfo, saved_ns
     return manifest.size_bytes()
 
 
-def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo]:
+def load_map(directory: str | os.PathLike[str], device: str = "cpu") -> SavedMap:
     """Read a map into a new one of its own configuration.
 
     Args:
@@ -138,22 +196,18 @@ def load_map(directory: Path, device: str = "cpu") -> tuple[SemanticMap, MapInfo
     Raises:
         StorageError: It is no map, of another version, incomplete or altered; the message names the file.
     """
+    directory = Path(directory)
     manifest, arrays = _read(directory)
     info = _info(directory, manifest, arrays)
     try:
-        map_config = MapConfig.model_validate({**info.config.map.model_dump(), "device": device})
-        semantic_map = SemanticMap(
-            manifest.dimension,
-            map_config,
-            manifest.variance_ratio,
-            info.config.fusion.window_radius_m,
-            info.config.fusion.keep_most_evidence,
-            manifest.encoder,
-        )
+        on_device = MapConfig.model_validate({**info.config.map.model_dump(), "device": device})
+        fusion = info.config.fusion.model_copy(update={"variance_ratio": manifest.variance_ratio})
+        config = info.config.model_copy(update={"map": on_device, "fusion": fusion})
+        semantic_map = SemanticMap.from_config(config, manifest.dimension, manifest.variance_ratio, manifest.encoder)
         semantic_map.import_state(arrays)
     except (ValueError, ConfigError, MapError) as error:
         raise _no_map(directory, error) from None
-    return semantic_map, info
+    return SavedMap(semantic_map, info)
 
 
 def restore_map(directory: Path, semantic_map: SemanticMap, config: Config, encoder: str) -> MapInfo:

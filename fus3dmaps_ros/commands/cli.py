@@ -77,7 +77,7 @@ def map_(
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the run's figures to this file.")] = None,
 ) -> None:
     """Map a recording in process and save the map."""
-    from fus3dmaps_core.offline import map_info, map_recording
+    from fus3dmaps_core.offline import map_recording
     from fus3dmaps_core.pipeline import Pipeline
     from fus3dmaps_core.saved_maps.storage import check_map_target, save_map
 
@@ -91,10 +91,10 @@ def map_(
     except RecordingError:
         if pipeline.semantic_map.voxel_count:
             pipeline.semantic_map.fuse()
-            save_map(out, pipeline.semantic_map, map_info(pipeline))
+            save_map(out, pipeline)
             _log.print(f"what could be read is mapped and saved in '{out}'", markup=False, style="yellow", soft_wrap=True)
         raise
-    save_map(out, pipeline.semantic_map, map_info(pipeline))
+    save_map(out, pipeline)
 
     semantic_map = pipeline.semantic_map
     table = Table("stage", "s", "share", title=f"{out}", title_justify="left")

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_core.offline import map_info
 from fus3dmaps_core.saved_maps.directory import list_maps, map_path, map_root
 from fus3dmaps_core.saved_maps.manifest import MANIFEST, read_manifest
 from fus3dmaps_core.saved_maps.storage import MapInfo, restore_map, save_map
@@ -29,9 +28,7 @@ def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
         StorageError: The name cannot be one, or the map cannot be written; a map that was there still is.
     """
     path = map_path(root, name)
-    # Before the map is copied: what is saved may be newer than the stamp, never older.
-    info = map_info(session.pipeline)
-    return path, save_map(path, session.pipeline.semantic_map, info)
+    return path, save_map(path, session.pipeline)
 
 
 def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:

@@ -10,7 +10,7 @@ from stand_ins import ColorSegmenter, color_trio, wall_frame
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_core.offline import map_info, map_recording
+from fus3dmaps_core.offline import map_recording
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.saved_maps.storage import load_map, save_map
@@ -57,7 +57,7 @@ def test_two_runs_and_their_files_are_equal_bit_for_bit(recording: Path, tmp_pat
     for name in ("a", "b"):
         pipeline = make_pipeline()
         map_recording(recording, pipeline)
-        save_map(tmp_path / name, pipeline.semantic_map, map_info(pipeline), saved_ns=1)
+        save_map(tmp_path / name, pipeline, saved_ns=1)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert files == sorted(path.name for path in (tmp_path / "b").iterdir())
     assert [name for name in files if (tmp_path / "a" / name).read_bytes() != (tmp_path / "b" / name).read_bytes()] == []

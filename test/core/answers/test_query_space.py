@@ -14,7 +14,7 @@ from fus3dmaps_core.answers.query import IMAGE_PROMPT, TextQuery, answer_image_q
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.pipeline import Pipeline
-from fus3dmaps_core.saved_maps.storage import MapInfo, load_map, save_map
+from fus3dmaps_core.saved_maps.storage import MapInfo, SavedMap, load_map, save_map
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 OTHER = "'another'.*'stand_in'"
@@ -30,7 +30,7 @@ def pipeline() -> Pipeline:
 
 def saved_and_loaded(pipeline: Pipeline, directory: Path) -> SemanticMap:
     info = MapInfo(pipeline.trio.name, 20.0, "map", 1, pipeline.config, pipeline.camera_poses())
-    save_map(directory, pipeline.semantic_map, info)
+    save_map(directory, SavedMap(pipeline.semantic_map, info))
     return load_map(directory)[0]
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from fus3dmaps_core.config.schema import Config, MapConfig
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_core.saved_maps.storage import MapInfo, save_map
+from fus3dmaps_core.saved_maps.storage import MapInfo, SavedMap, save_map
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 
@@ -39,7 +39,7 @@ def save_on(contents: list[dict[str, np.ndarray]], request: dict) -> None:
         info = MapInfo("lite", 1.0, "map", number, Config(), np.tile(np.eye(4) * number, (1 + number % 3, 1, 1)))
         say(f"saving {number}")
         try:
-            save_map(Path(request["directory"]), maps[number % len(maps)], info)
+            save_map(Path(request["directory"]), SavedMap(maps[number % len(maps)], info))
         except StorageError as error:
             say(f"refused {number} {error}")
         else:

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fus3dmaps_core.errors import StorageError
 from fus3dmaps_core.saved_maps.directory import MAX_NAME_BYTES, list_maps, map_path, map_root
-from fus3dmaps_core.saved_maps.storage import load_map, save_map
+from fus3dmaps_core.saved_maps.storage import SavedMap, load_map, save_map
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def test_a_relative_directory_is_that_of_the_process(tmp_path: Path, monkeypatch
 def test_maps_are_listed_by_the_time_of_their_save(tmp_path: Path):
     semantic_map = filled_map(np.random.default_rng(2))
     for name, saved_ns in (("b", 30), ("oldest", 10), ("newest", 40), ("a", 30)):
-        save_map(map_path(tmp_path, name), semantic_map, INFO, saved_ns=saved_ns)
+        save_map(map_path(tmp_path, name), SavedMap(semantic_map, INFO), saved_ns=saved_ns)
     os.utime(tmp_path / "oldest" / "manifest.json")  # Times of files do not count: copies of maps have others.
     assert list_maps(tmp_path) == ["newest", "a", "b", "oldest"]
     load_map(map_path(tmp_path, "newest"))
@@ -133,7 +133,7 @@ def test_maps_are_listed_by_the_time_of_their_save(tmp_path: Path):
 def test_what_cannot_be_read_is_not_listed(tmp_path: Path):
     semantic_map = filled_map(np.random.default_rng(2))
     for age, name in enumerate(("good", "other_version", "damaged", "killed", ".hidden")):
-        save_map(tmp_path / name, semantic_map, INFO, saved_ns=age)
+        save_map(tmp_path / name, SavedMap(semantic_map, INFO), saved_ns=age)
     edit_manifest(tmp_path / "other_version", lambda manifest: manifest.update(version=3))
     (tmp_path / "damaged" / "manifest.json").write_text("{")
     (tmp_path / "killed" / "manifest.json").unlink()

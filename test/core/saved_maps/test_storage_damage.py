@@ -15,20 +15,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_core.saved_maps.storage import load_map, save_map
+from fus3dmaps_core.saved_maps.storage import SavedMap, load_map, save_map
 
 
 @pytest.fixture(scope="module")
 def kept(tmp_path_factory) -> Path:
     """A map that every test leaves as it found it."""
     directory = tmp_path_factory.mktemp("kept") / "m"
-    save_map(directory, filled_map(np.random.default_rng(4)), INFO)
+    save_map(directory, SavedMap(filled_map(np.random.default_rng(4)), INFO))
     return directory
 
 
 @pytest.fixture
 def saved(tmp_path: Path, rng) -> Path:
-    save_map(tmp_path / "m", filled_map(rng), INFO)
+    save_map(tmp_path / "m", SavedMap(filled_map(rng), INFO))
     return tmp_path / "m"
 
 

@@ -15,7 +15,7 @@ from reference.variants import DTYPES
 from fus3dmaps_core.config.schema import fields
 from fus3dmaps_core.saved_maps.directory import MAX_NAME_BYTES
 from fus3dmaps_core.saved_maps.manifest import DIGITS_IN_NAME, FORMAT, ArrayFile, Manifest
-from fus3dmaps_core.saved_maps.storage import FORMAT_VERSION, save_map
+from fus3dmaps_core.saved_maps.storage import FORMAT_VERSION, SavedMap, save_map
 
 PAGE = (Path(__file__).resolve().parents[3] / "docs" / "map_files.md").read_text()
 JSON_TYPES = {"string": str, "integer": int, "number": float, "object": dict}
@@ -31,7 +31,7 @@ def table(heading: str) -> list[list[str]]:
 @pytest.fixture(scope="module", params=DTYPES)
 def saved(request, tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("format") / "m"
-    save_map(directory, filled_map(np.random.default_rng(6), request.param), INFO)
+    save_map(directory, SavedMap(filled_map(np.random.default_rng(6), request.param), INFO))
     return directory
 
 

@@ -15,7 +15,7 @@ from core.saved_maps.saved_maps import INFO, assert_equal_states, files_of, fill
 
 from fus3dmaps_core.errors import StorageError
 from fus3dmaps_core.saved_maps.files import LOCK
-from fus3dmaps_core.saved_maps.storage import load_map, read_manifest, save_map
+from fus3dmaps_core.saved_maps.storage import SavedMap, load_map, read_manifest, save_map
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 STEPS = ((os, "open"), (os, "fsync"), (np, "save"), (Path, "mkdir"), (Path, "open"), (Path, "replace"))
@@ -37,7 +37,7 @@ def intercept(monkeypatch, steps, before: Callable[[str, tuple], None]) -> None:
 def test_what_is_on_disk_at_every_step_is_one_of_the_two_maps(tmp_path: Path, rng, monkeypatch):
     old, new = filled_map(rng), filled_map(rng, frames=6)
     directory = tmp_path / "m"
-    save_map(directory, old, INFO)
+    save_map(directory, SavedMap(old, INFO))
     copies: list[Path] = []
 
     copying: list[bool] = []
@@ -50,7 +50,7 @@ def test_what_is_on_disk_at_every_step_is_one_of_the_two_maps(tmp_path: Path, rn
 
     with monkeypatch.context() as during:
         intercept(during, (*STEPS, (Path, "unlink")), copy)
-        save_map(directory, new, INFO)
+        save_map(directory, SavedMap(new, INFO))
     states = {semantic_map.voxel_count: semantic_map.export_state() for semantic_map in (old, new)}
     assert len(states) == 2
     counts = []
@@ -64,7 +64,7 @@ def test_what_is_on_disk_at_every_step_is_one_of_the_two_maps(tmp_path: Path, rn
 
     # Each of them can be saved to, which leaves nothing of the interrupted save.
     for path in copies:
-        save_map(path, old, INFO)
+        save_map(path, SavedMap(old, INFO))
         assert {name for name in files_of(path) if name.endswith(".writing")} == set()
         assert len(files_of(path)) == len(files_of(directory))
 
@@ -72,7 +72,7 @@ def test_what_is_on_disk_at_every_step_is_one_of_the_two_maps(tmp_path: Path, rn
 def refusal_of(directory: Path, semantic_map: SemanticMap) -> str | None:
     """What a save says that is refused; None of one that is not."""
     try:
-        save_map(directory, semantic_map, INFO)
+        save_map(directory, SavedMap(semantic_map, INFO))
     except StorageError as error:
         return str(error)
     return None
@@ -86,7 +86,7 @@ def test_a_save_that_fails_at_any_step_changes_nothing(tmp_path: Path, rng, monk
     while hit:
         directory = tmp_path / str(refused + went_on) / "m"
         if replaces:
-            save_map(directory, old, INFO)
+            save_map(directory, SavedMap(old, INFO))
         before = files_of(directory) if replaces else None
         steps, hit, committed = refused + went_on, False, False
 
@@ -122,7 +122,7 @@ def test_a_save_that_fails_at_any_step_changes_nothing(tmp_path: Path, rng, monk
 
 def test_what_is_renamed_lasts_and_names_last_before_the_manifest_speaks_of_them(tmp_path: Path, rng, monkeypatch):
     directory = tmp_path / "maps" / "m"
-    save_map(directory, filled_map(rng), INFO)
+    save_map(directory, SavedMap(filled_map(rng), INFO))
     events: list[tuple[str, str]] = []
 
     def record(name: str, args: tuple) -> None:
@@ -134,7 +134,7 @@ def test_what_is_renamed_lasts_and_names_last_before_the_manifest_speaks_of_them
             events.append((name, Path(args[0]).suffix))
 
     intercept(monkeypatch, ((os, "fsync"), (Path, "replace"), (Path, "unlink")), record)
-    save_map(directory, filled_map(rng, frames=6), INFO)
+    save_map(directory, SavedMap(filled_map(rng, frames=6), INFO))
     monkeypatch.undo()
     manifest = ".manifest.json.writing"
     commit = events.index(("replace", manifest))
@@ -151,21 +151,21 @@ def test_what_is_renamed_lasts_and_names_last_before_the_manifest_speaks_of_them
 def test_a_new_directory_lasts(tmp_path: Path, rng, monkeypatch):
     synced: list[str] = []
     intercept(monkeypatch, ((os, "fsync"),), lambda _, args: synced.append(Path(f"/proc/self/fd/{args[0]}").readlink().name))
-    save_map(tmp_path / "maps" / "m", filled_map(rng), INFO)
+    save_map(tmp_path / "maps" / "m", SavedMap(filled_map(rng), INFO))
     assert {tmp_path.name, "maps", "m"} <= set(synced)
 
 
 def test_a_map_that_is_being_saved_elsewhere_is_refused_by_name(tmp_path: Path, rng):
     directory = tmp_path / "kitchen"
-    save_map(directory, filled_map(rng), INFO)
+    save_map(directory, SavedMap(filled_map(rng), INFO))
     before = files_of(directory)
     with (directory / LOCK).open("rb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         (directory / ".dense_weight.0123456789abcdef.npy.writing").write_bytes(b"of the other saver")
         with pytest.raises(StorageError, match=r"kitchen.*is being saved by another"):
-            save_map(directory, filled_map(rng), INFO)
+            save_map(directory, SavedMap(filled_map(rng), INFO))
         leftover = {".dense_weight.0123456789abcdef.npy.writing": b"of the other saver"}
         assert files_of(directory) == before | leftover
         load_map(directory)
-    save_map(directory, filled_map(rng), INFO)
+    save_map(directory, SavedMap(filled_map(rng), INFO))
     assert not leftover.keys() & files_of(directory).keys()

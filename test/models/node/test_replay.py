@@ -18,7 +18,7 @@ from robot import TIMEOUT_S, wait_until
 from fus3dmaps_core.answers.query import LAYERS, TextQuery, answer_query
 from fus3dmaps_core.encoders.registry import card, load_text_encoder, names
 from fus3dmaps_core.errors import QueryError, StorageError
-from fus3dmaps_core.offline import map_info, map_recording
+from fus3dmaps_core.offline import map_recording
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.saved_maps.storage import load_map, restore_map, save_map
 from fus3dmaps_msgs.msg import MapperStatus
@@ -47,7 +47,7 @@ def offline(cached, recording, maps, config) -> Any:
         if not path.exists():
             pipeline = Pipeline.from_config(config(name))
             map_recording(recording, pipeline)
-            save_map(path, pipeline.semantic_map, map_info(pipeline))
+            save_map(path, pipeline)
         return path
 
     return mapped
