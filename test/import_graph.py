@@ -68,12 +68,13 @@ class ImportGraph:
         tree = ast.parse(path.read_text(), str(path))
         package = importer if path.name == "__init__.py" else importer.rpartition(".")[0]
         loads_by_name = any(_names(node) & _LOADERS for node in ast.walk(tree))
+        pieces = {piece for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for piece in node.values}
         for node in ast.walk(tree):
             if isinstance(node, ast.Import):
                 targets = [alias.name for alias in node.names]
             elif isinstance(node, ast.ImportFrom):
                 targets = self._from(node, package)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and loads_by_name:
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and loads_by_name and node not in pieces:
                 targets = self._text(node.value, package)
             else:
                 continue
@@ -81,20 +82,26 @@ class ImportGraph:
             yield from (Import(importer, target, where) for target in targets if target.partition(".")[0] in self._packages)
 
     def _from(self, node: ast.ImportFrom, package: str) -> list[str]:
-        base = node.module or ""
-        if node.level:
-            parts = package.split(".")
-            base = ".".join([*parts[: len(parts) - node.level + 1], *([base] if base else [])])
+        base = _absolute(node.level, node.module or "", package)
         names = [f"{base}.{alias.name}" for alias in node.names if alias.name != "__version__"]
         return [name if name in self.modules else base for name in names]
 
     def _text(self, text: str, package: str) -> list[str]:
-        """The module that a text names: ``package.module``, ``package.module.attribute``, ``package.module:attribute``."""
-        match = _MODULE_PATH.fullmatch(f"{package}{text}" if text.startswith(".") else text)
+        """The module that a text names: ``package.module``, with or without an attribute, or ``.module``."""
+        if text.startswith("."):  # More often the end of a file's name than a module.
+            name = _absolute(len(text) - len(text.lstrip(".")), text.lstrip("."), package)
+            return [name] if name in self.modules else []
+        match = _MODULE_PATH.fullmatch(text)
         if match is None:
             return []
         name, parent = match[1], match[1].rpartition(".")[0]
         return [parent if name not in self.modules and parent in self.modules else name]
+
+
+def _absolute(level: int, name: str, package: str) -> str:
+    """A module's full name, from the dots before it, the rest, and the package of who imports it."""
+    parts = package.split(".")
+    return ".".join([*(parts[: len(parts) - level + 1] if level else ()), *([name] if name else ())])
 
 
 def _names(node: ast.AST) -> set[str]:
