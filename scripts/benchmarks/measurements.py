@@ -37,13 +37,13 @@ class Measurement:
     spread: Mapping[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """The figure as an entry of the JSON file."""
+        """Return the figure as an entry of the JSON file."""
         entry = {"name": self.name, "params": dict(self.params), "value": self.value, "unit": self.unit}
         return {**entry, "spread": dict(self.spread)} if self.spread else entry
 
 
 def timed(name: str, params: Mapping[str, Any], times: Times) -> Measurement:
-    """A measurement in milliseconds."""
+    """Make a measurement in milliseconds."""
     return Measurement(name, params, times.median_ms, "ms", spread(times.samples_ms))
 
 

@@ -84,7 +84,7 @@ class Seconds:
 
     @classmethod
     def of(cls, samples_s: Iterable[float], share: float = 1.0) -> Seconds:
-        """From samples, each times a share, e.g. one over the size of a batch."""
+        """Summarize samples, each times a share, e.g. one over the size of a batch."""
         values = [share * sample for sample in samples_s]
         return cls(min(values), float(np.median(values)), len(values))
 
@@ -159,13 +159,13 @@ class ModelFigures:
 
 
 def seconds(call: Callable[[], object], device: str) -> float:
-    """Time of one call with the device's work in it, seconds."""
+    """Time one call with the device's work in it, seconds."""
     gc.collect()
     return time_call(call, device) / 1000.0
 
 
 def sample(call: Callable[[int], object], first_s: float, job: Job) -> list[float]:
-    """Times of call(1), call(2), ... as far as repeats and budget of the job go, seconds.
+    """Time call(1), call(2), ... as far as repeats and budget of the job go, seconds.
 
     Args:
         call: What is timed.
@@ -179,12 +179,12 @@ def sample(call: Callable[[int], object], first_s: float, job: Job) -> list[floa
 
 
 def parameters_of(modules: Iterable[nn.Module]) -> dict[int, int]:
-    """Elements of each weight by its identity, so that what modules share counts once."""
+    """Count the elements of each weight by its identity, so that what modules share counts once."""
     return {id(weight): weight.numel() for module in modules for weight in module.parameters()}
 
 
 def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
-    """Modules that an object's attributes hold, or theirs in turn."""
+    """Collect the modules that an object's attributes hold, or theirs in turn."""
     if isinstance(value, nn.Module):
         return [value]
     if depth == 0 or not hasattr(value, "__dict__"):
@@ -193,7 +193,7 @@ def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
 
 
 def resident_bytes(field: str) -> int:
-    """Resident memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
+    """Return the memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
 
     The peak that getrusage tells is inherited from the parent.
     """
@@ -205,7 +205,7 @@ def resident_bytes(field: str) -> int:
 
 
 def device_bytes(device: str) -> tuple[int | None, int | None]:
-    """The most that torch held on a CUDA device, and what is in use on it now; None and None elsewhere."""
+    """Return the most that torch held on a CUDA device, and what is in use on it now; None and None elsewhere."""
     if torch.device(device).type != "cuda":
         return None, None
     free, total = torch.cuda.mem_get_info(device)
@@ -213,6 +213,6 @@ def device_bytes(device: str) -> tuple[int | None, int | None]:
 
 
 def precision_of(module: nn.Module) -> str:
-    """Precision of a network's weights, e.g. ``float32``."""
+    """Return the precision of a network's weights, e.g. ``float32``."""
     dtype = next(value.dtype for value in module.state_dict().values() if value.is_floating_point())
     return str(dtype).removeprefix("torch.")

@@ -81,7 +81,7 @@ def _measure(job: Job) -> dict[str, Any]:
 
 
 def cpu_seconds() -> tuple[float, float, float]:
-    """Time of all cores since the start of the machine, their busy time, and this process's with its children, seconds."""
+    """Return seconds of all cores since the machine's start, the busy ones, and this process's with its children."""
     ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
     idle = ticks[3] + ticks[4]
     per_second = os.sysconf("SC_CLK_TCK")
@@ -89,7 +89,7 @@ def cpu_seconds() -> tuple[float, float, float]:
 
 
 def view(height: int, width: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """A frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
+    """Render a frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
     frame = FurnishedRoom().frame(_VIEW)
     rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)

@@ -75,7 +75,7 @@ def write_sam2(folder: Path) -> str:
 
 
 def radio_code() -> str:
-    """Whose code builds RADIO's networks beside random weights: its authors' or that of the tests."""
+    """Tell whose code builds RADIO's networks beside random weights: its authors' or that of the tests."""
     files = _helper("radio_files")
     return "stand-in" if files.find_checkout() == files.STAND_IN else "RADIO's own"
 
@@ -107,7 +107,7 @@ def _write_clip_dinoiser(folder: Path) -> None:
 
 
 def _helper(name: str) -> Any:
-    """A module of the tests' folder, which scripts/bench has on the path."""
+    """Import a module of the tests' folder, which scripts/bench has on the path."""
     return import_module(name)
 
 

@@ -118,7 +118,7 @@ def _size(job: Job, segmenter: Any) -> _Size:
 
 
 def sam2_flops(network: Any, image: torch.Tensor, points: torch.Tensor, per_pass: int) -> int:
-    """Operations of SAM 2 on a frame: those of the image encoder, and of the decoder, which every point costs the same.
+    """Count SAM 2's operations on a frame: the image encoder's, and the decoder's, which every point costs the same.
 
     Args:
         network: ``Sam2Model``.

@@ -48,7 +48,7 @@ def ask(semantic_map: SemanticMap, *prompts: str, logit_scale: float = 10.0, **f
 
 def three_objects() -> SemanticMap:
     semantic_map = a_map()
-    propose(semantic_map, range(0, 5), X)
+    propose(semantic_map, range(5), X)
     propose(semantic_map, range(10, 15), X + Y)
     propose(semantic_map, range(20, 25), Y)
     return semantic_map

@@ -46,7 +46,7 @@ def room() -> FurnishedRoom:
 def recording(room: FurnishedRoom, tmp_path_factory) -> Path:
     """The frames of the room's path that see the cat."""
     label = 1 + [thing.name for thing in room.objects].index("cat")
-    seen = [index for index in range(0, len(room) // 2) if (room.rendering(index).labels == label).sum() > 20_000]
+    seen = [index for index in range(len(room) // 2) if (room.rendering(index).labels == label).sum() > 20_000]
     path = tmp_path_factory.mktemp("room") / "cat.mcap"
     with RecordingWriter(path) as writer:
         for index in seen[:5]:
