@@ -10,8 +10,7 @@ from fus3dmaps_lab.simulation.room.furnished_room import FurnishedRoom
 COLORS = {"green": (60, 120, 60), "blue": (50, 80, 160), "brown": (120, 90, 60), "white": (225, 220, 210)}
 
 
-def embed(rgb):
-    """Describe colours (..., 3) by how near they are to the named ones: unit vectors (..., 4)."""
+def embed(rgb):  # (..., 3) colours to (..., 4) unit vectors: how near they are to the named ones.
     near = np.exp(-np.linalg.norm(rgb[..., None, :] - np.array([*COLORS.values()], float), axis=-1) / 60)
     return (near / np.linalg.norm(near, axis=-1, keepdims=True)).astype(np.float32)
 
@@ -23,9 +22,8 @@ class ColorEncoder:
         return height // 16, width // 16
 
     def encode_patches(self, rgb):
-        rows, columns = self.grid(*rgb.shape[:2])
-        means = rgb.reshape(rows, 16, columns, 16, 3).mean(axis=(1, 3))
-        return PatchEmbeddings(embed(means), np.ones((rows, columns), np.float32))
+        means = rgb.reshape(-1, 16, rgb.shape[1] // 16, 16, 3).mean(axis=(1, 3))
+        return PatchEmbeddings(embed(means), np.ones(means.shape[:2], np.float32))
 
     def encode_crops(self, rgb, masks):
         return embed(np.array([rgb[mask].mean(axis=0) for mask in masks.masks]))
