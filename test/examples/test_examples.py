@@ -50,11 +50,11 @@ def test_a_map_from_arrays_and_a_saved_map_asked_take_as_few_lines_as_promised(r
     assert len(saved.splitlines()) <= 4
     monkeypatch.chdir(tmp_path)
     names = {"frames": [(frame.stamp_ns, frame.rgb, frame.depth_m, frame.T_world_camera) for frame in room]}
-    exec(arrays, names)
+    exec(arrays, names)  # noqa: S102  (the code is the README's)
     assert np.linalg.norm(position_of("a pet that meows", capsys.readouterr().out) - CAT_M) < 0.3
     assert names["camera"] == room.intrinsics
     mapped = names["pipeline"].ask("a place to sit")
-    exec(saved, names)
+    exec(saved, names)  # noqa: S102
     assert capsys.readouterr().out == f"{mapped}\n"
     assert [each.id for each in names["answer"].instances] == [each.id for each in mapped.instances]
 
