@@ -15,7 +15,7 @@ from torch.nn import functional
 from fus3dmaps_core.encoders import siglip2
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
-from fus3dmaps_core.encoders.graphs import Graph, Network
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.encoders.radio import pair as radio_pair
 from fus3dmaps_core.encoders.siglip2 import published as siglip2_published

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from fus3dmaps_core.encoders.crop_batches import CropBatcher
-from fus3dmaps_core.encoders.graphs import Graph, Network
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import PatchEmbeddings
 from fus3dmaps_core.masks import Masks
 
@@ -80,7 +80,7 @@ class NetworkPatchEncoder:
         return Graph("patch", self.network, (1, 3, *self._stretched(height, width)), self._outputs)
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network
 
     def _stretched(self, height: int, width: int) -> tuple[int, int]:
@@ -135,5 +135,5 @@ class NetworkCropEncoder:
         return Graph("crop", self.network, (_BATCH, 3, self._size_px, self._size_px), ("embeddings",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network

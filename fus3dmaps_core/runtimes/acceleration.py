@@ -6,13 +6,13 @@ Images alone are concerned. The text tower stays in torch: a prompt comes once i
 from __future__ import annotations
 
 from fus3dmaps_core.config.schema import EncoderConfig, ImageConfig
-from fus3dmaps_core.encoders.graphs import Network
+from fus3dmaps_core.encoders.network_graphs import Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.runtimes.compiled_network import CompiledNetwork
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.exporting import NamedEncoder, ensure_exported, graph_encoders
 from fus3dmaps_core.runtimes.graph_files import graph_directory, own_precision
 from fus3dmaps_core.runtimes.image_memory import naming_image_size
-from fus3dmaps_core.runtimes.opening import open_network
 from fus3dmaps_core.runtimes.packages import import_onnxruntime, import_tensorrt
 from fus3dmaps_core.runtimes.tensorrt_network import check_cuda
 

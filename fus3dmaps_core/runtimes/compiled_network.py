@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.static_batches import listed, run_in_batches
 

@@ -12,7 +12,7 @@ import torch
 
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import graph_hash, slug, write_atomically
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug, write_atomically
 from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB, build_engine, load_engine
 
 _HASH_DIGITS = 16

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import CropEncoder, PatchEncoder
 from fus3dmaps_core.masks import Masks
 

@@ -12,13 +12,13 @@ from typing import cast
 import torch
 
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.example_images import GraphCropEncoder, GraphPatchEncoder, crop_images, patch_images
-from fus3dmaps_core.runtimes.files import external_data
 from fus3dmaps_core.runtimes.graph_files import checksum_path, graph_path, is_whole, write_checksum
-from fus3dmaps_core.runtimes.onnx_export import OPSET, plain_network, write_onnx
+from fus3dmaps_core.runtimes.onnx_writer import OPSET, plain_network, write_onnx
 from fus3dmaps_core.runtimes.packages import check_exporter, import_onnxruntime
 from fus3dmaps_core.runtimes.parity import Parity, check_parity
 

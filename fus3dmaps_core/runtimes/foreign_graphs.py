@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import graph_hash, slug
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug
 from fus3dmaps_core.runtimes.graph_files import checksum_path, is_whole, write_checksum
 from fus3dmaps_core.runtimes.half_precision import emulate_products, round_products
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork

@@ -10,10 +10,10 @@ from torch import nn
 
 from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.encoders.weights import cache_directory
-from fus3dmaps_core.runtimes.files import graph_hash, slug
-from fus3dmaps_core.runtimes.onnx_export import OPSET
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug
+from fus3dmaps_core.runtimes.onnx_writer import OPSET
 
 _FINGERPRINT_DIGITS = 16
 

@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn import functional
 
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.half_precision import emulate_products
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork

@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import write_atomically
+from fus3dmaps_core.runtimes.cached_files import write_atomically
 
 WORKSPACE_MIB = 2048
 """Scratch memory that an engine may take while it runs; more lets TensorRT choose from more kernels."""

@@ -14,7 +14,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from fus3dmaps_core.encoders.lite.weights import DETECTOR_GRAPH, DETECTOR_LAYOUT
+from fus3dmaps_core.encoders.lite.packaged_files import DETECTOR_GRAPH, DETECTOR_LAYOUT
 
 DETECTOR_INPUT = (1, 3, 300, 300)
 """Of the detector that ``lite`` has beside its classifier."""

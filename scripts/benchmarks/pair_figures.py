@@ -25,7 +25,7 @@ from benchmarks.model_figures import (
     seconds,
 )
 from fus3dmaps_core.config.schema import ImageConfig
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.masks import Masks

@@ -20,7 +20,7 @@ from siglip2_files import published_state, random_model, write_directory, write_
 from tokenizers import Tokenizer
 
 from fus3dmaps_core.encoders import siglip2
-from fus3dmaps_core.encoders.graphs import GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.encoders.siglip2.network import (

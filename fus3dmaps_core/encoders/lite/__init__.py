@@ -6,7 +6,7 @@ small sentence model (all-MiniLM-L6-v2) embeds these names and the prompts in on
 those 1000 + 80 names: a prompt is answered through the names nearest to it in meaning. **It is not CLIP**, nor any other
 network trained on images and text together, and what it scores says nothing about the vision-language models of the paper.
 
-Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.weights`. Nothing is ever downloaded.
+Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.packaged_files`. Nothing is ever downloaded.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
 from fus3dmaps_core.encoders.lite.detector import shared_detector
 from fus3dmaps_core.encoders.lite.network import load_classifier
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER, DETECTOR_GRAPH, TEXT_MODEL, PackagedFile
 from fus3dmaps_core.encoders.lite.patch import LitePatchEncoder
 from fus3dmaps_core.encoders.lite.space import DIMENSION, ConceptSpace, LiteTextEncoder
 from fus3dmaps_core.encoders.lite.text import SentenceModel
 from fus3dmaps_core.encoders.lite.vocabulary import load_vocabulary
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER, DETECTOR_GRAPH, TEXT_MODEL, WeightFile
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
 
-def _shipped(title: str, file: WeightFile) -> ShippedFile:
+def _shipped(title: str, file: PackagedFile) -> ShippedFile:
     return ShippedFile(title, file.package, file.version, file.path, "Apache-2.0")
 
 

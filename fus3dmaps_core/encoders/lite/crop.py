@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import crop_evidence
 from fus3dmaps_core.encoders.lite.network import CLASSES, MEAN, EfficientNetLite0
 from fus3dmaps_core.encoders.lite.space import ConceptSpace
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.masks import Masks
 
 # The network was trained at 224 pixels; most crops are smaller than this, and finds are as good in half the time.
@@ -49,7 +49,7 @@ class LiteCropEncoder:
         return Graph("crop", self._network, (_BATCH, 3, _SIZE_PX, _SIZE_PX), ("logits",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network
 
     def _crop(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_], box: NDArray[np.int32]) -> NDArray[np.uint8]:

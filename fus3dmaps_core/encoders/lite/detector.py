@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.lite.weights import DETECTOR_GRAPH, DETECTOR_LAYOUT
+from fus3dmaps_core.encoders.lite.packaged_files import DETECTOR_GRAPH, DETECTOR_LAYOUT
 
 _INPUT_SIZE = 300
 _MIN_SCORE = 0.1

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER
 
 FEATURE_STRIDE = 32
 FEATURE_WIDTH = 1280

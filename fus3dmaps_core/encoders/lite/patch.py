@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import patch_evidence
 from fus3dmaps_core.encoders.lite.network import FEATURE_STRIDE, EfficientNetLite0, PatchLogits
 from fus3dmaps_core.encoders.lite.space import ConceptSpace
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import PatchEmbeddings
 
 _UPSAMPLING = 2  # 16-pixel patches from a feature map of stride 32.
@@ -52,5 +52,5 @@ class LitePatchEncoder:
         return Graph("patch", self._network, (1, 3, rows * _PATCH_PX, columns * _PATCH_PX), ("logits",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.lite.weights import EXTRA, TEXT_CONFIG, TEXT_MODEL, TOKENIZER
+from fus3dmaps_core.encoders.lite.packaged_files import EXTRA, TEXT_CONFIG, TEXT_MODEL, TOKENIZER
 from fus3dmaps_core.errors import EncoderError
 
 WIDTH = 384

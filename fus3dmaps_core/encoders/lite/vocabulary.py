@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fus3dmaps_core.encoders.lite.packaged_files import IMAGENET_NAMES, TEXT_MODEL, TOKENIZER
 from fus3dmaps_core.encoders.lite.text import WIDTH, SentenceModel
-from fus3dmaps_core.encoders.lite.weights import IMAGENET_NAMES, TEXT_MODEL, TOKENIZER
 
 COCO_CATEGORIES = 91
 """Category ids run from 1 to 90."""

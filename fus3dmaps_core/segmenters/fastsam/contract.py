@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fus3dmaps_core.encoders.optional_packages import import_optional
-from fus3dmaps_core.segmenters.fastsam.proposals import PROTOTYPES, STRIDE
+from fus3dmaps_core.segmenters.fastsam.decoding import PROTOTYPES, STRIDE
 from fus3dmaps_core.segmenters.fastsam.published import refusal
 
 _STRIDES = (8, 16, 32)  # Of the three grids whose cells are the anchors.

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Network
+from fus3dmaps_core.encoders.network_graphs import Network
 from fus3dmaps_core.masks import Masks
+from fus3dmaps_core.segmenters.fastsam.decoding import masks_of, select
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.fastsam.proposals import masks_of, select
 
 
 class FastSamSegmenter:

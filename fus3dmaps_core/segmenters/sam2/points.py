@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from fus3dmaps_core.segmenters.proposals import stability
+from fus3dmaps_core.segmenters.mask_tensors import stability
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from fus3dmaps_core.masks import Masks
-from fus3dmaps_core.segmenters.proposals import (
+from fus3dmaps_core.segmenters.mask_tensors import (
     best_first,
     box_overlaps,
     first_of_overlapping,

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.segmenters.fastsam.decoding import MAX_PROPOSALS, masks_of, select
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.fastsam.proposals import MAX_PROPOSALS, masks_of, select
 from fus3dmaps_core.segmenters.fastsam.segmenter import FastSamSegmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
 

@@ -11,9 +11,9 @@ import torch
 from onnx import TensorProto, helper
 
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.graph_input import input_shape
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
-from fus3dmaps_core.runtimes.opening import open_network
 
 SHAPE = (3, 3, 4, 6)
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 from graph_trios import HEIGHT, PAIRS, WIDTH, boxes
 
-from fus3dmaps_core.encoders.graphs import GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import GraphEncoder
 from fus3dmaps_core.runtimes.exporting import ExportedGraph, export_graph, graph_encoders
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
 from fus3dmaps_core.runtimes.parity import BOUNDS

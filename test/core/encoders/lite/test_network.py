@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from fus3dmaps_core.encoders.lite.network import EfficientNetLite0, load_classifier
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER, IMAGENET_NAMES
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER, IMAGENET_NAMES
 
 
 @pytest.fixture(scope="module")

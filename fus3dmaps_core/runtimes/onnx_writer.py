@@ -15,9 +15,9 @@ from torch import nn
 
 from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
-from fus3dmaps_core.runtimes.files import external_data
+from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.half_precision import round_products
 
 OPSET = 18

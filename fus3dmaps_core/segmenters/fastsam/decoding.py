@@ -11,7 +11,7 @@ import torch
 
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.proposals import best_first, box_overlaps, first_of_overlapping, mask_overlaps, masks_at
+from fus3dmaps_core.segmenters.mask_tensors import best_first, box_overlaps, first_of_overlapping, mask_overlaps, masks_at
 
 PROTOTYPES = 32
 """Masks whose weighted sums are the masks of objects."""

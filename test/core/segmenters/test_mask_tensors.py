@@ -9,8 +9,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from fus3dmaps_core.segmenters import proposals
-from fus3dmaps_core.segmenters.proposals import (
+from fus3dmaps_core.segmenters import mask_tensors
+from fus3dmaps_core.segmenters.mask_tensors import (
     best_first,
     box_overlaps,
     first_of_overlapping,
@@ -141,7 +141,7 @@ def test_what_lies_beside_the_image_does_not_reach_into_it():
 def test_many_masks_are_made_in_parts(monkeypatch):
     logits = torch.from_numpy(np.random.default_rng(0).normal(size=(9, 5, 6)).astype(np.float32))
     whole = masks_at(logits, 17, 23)
-    monkeypatch.setattr(proposals, "_CHUNK_PIXELS", 2 * 17 * 23)
+    monkeypatch.setattr(mask_tensors, "_CHUNK_PIXELS", 2 * 17 * 23)
     parts = masks_at(logits, 17, 23)
     assert np.array_equal(whole.masks, parts.masks)
     assert np.array_equal(whole.boxes, parts.boxes)
