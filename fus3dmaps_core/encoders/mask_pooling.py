@@ -3,7 +3,7 @@
 A crop costs a pass of a network, and shows the object without its surroundings at another scale than the network's patches.
 The patches of the same frame have been embedded already, in context; what a mask is about is their mean under the mask, in
 which a pixel counts by its distance to the mask's edge: patches across an edge mix two things, and segmenters err there.
-The idea is that of Igelbrink et al. 2026, "DISC"; pooling here is over a pair's dense embeddings, whichever pair it is.
+The idea is that of Igelbrink et al. 2026, "DISC"; pooling here is over the patch embeddings of any trio.
 """
 
 from __future__ import annotations

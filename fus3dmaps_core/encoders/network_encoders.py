@@ -1,6 +1,6 @@
 """Patch and crop encoders around one torch network each, which takes normalised images and gives unit embeddings.
 
-The pairs differ in their networks; how frames and crops are brought to them, and what else may run in their place, is here.
+The trios differ in their networks; how frames and crops are brought to them, and what else may run in their place, is here.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """SigLIP's text towers: ``transformers`` builds them, one file holds their weights, another the words that they know.
 
-The encoders of several pairs live in such a tower's space; each says which one, and with which templates it is asked.
+The encoders of several trios live in such a tower's space; each says which one, and with which templates it is asked.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class SiglipTextEncoder:
     The unit embeddings of a prompt's sentences are averaged, and the mean is brought to unit length.
 
     Attributes:
-        space: Name of the pair.
+        space: Name of the trio.
     """
 
     def __init__(self, tower: Any, tokenizer: Any, published: TextTower, device: str, encoder: str) -> None:
@@ -82,7 +82,7 @@ class SiglipTextEncoder:
             tokenizer: ``tokenizers.Tokenizer``.
             published: What the two are.
             device: Torch device.
-            encoder: Name of the pair.
+            encoder: Name of the trio.
 
         Raises:
             EncoderError: The package ``open_clip``, which has the templates, is missing.
@@ -145,7 +145,7 @@ def read_text(
         model: File of the whole model.
         tokenizer: JSON file of the package ``tokenizers``.
         device: Torch device.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
         dtype: Precision of the tower; embeddings are averaged and handed out in float32.
 
     Raises:
@@ -198,7 +198,7 @@ def read_part(path: Path, prefix: str, encoder: str) -> dict[str, torch.Tensor]:
     Args:
         path: File of the whole model.
         prefix: Before the names of these weights.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The package ``safetensors`` is missing, or the file is no weight file.

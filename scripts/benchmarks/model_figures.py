@@ -24,7 +24,7 @@ class Job:
     """What is to be measured.
 
     Attributes:
-        kind: ``pair`` or ``segmenter``.
+        kind: ``trio`` or ``segmenter``.
         name: Registry name.
         device: Torch device.
         runtime: ``encoder.runtime``.
@@ -60,7 +60,7 @@ class Job:
     def encoder(self) -> EncoderConfig:
         """How encoders and segmenters are run; graphs and engines lie in the scratch directory."""
         return EncoderConfig(
-            name=self.name if self.kind == "pair" else "lite",
+            name=self.name if self.kind == "trio" else "lite",
             device=self.device,
             runtime=self.runtime,
             precision=self.precision,
@@ -94,7 +94,7 @@ class ModelFigures:
     """One model.
 
     Attributes:
-        kind: ``pair`` or ``segmenter``.
+        kind: ``trio`` or ``segmenter``.
         name: Registry name, of a segmenter from a file with the file's.
         device: Torch device.
         runtime: What ran the image networks.

@@ -1,4 +1,4 @@
-"""The pair on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map."""
+"""The trio on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pair_maps import map_by_name, map_with_pooled_patches
 from reference.clip_vit import patch_features
 from safetensors.torch import save_file
+from trio_maps import map_by_name, map_with_pooled_patches
 
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
@@ -233,5 +233,5 @@ def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
     map_with_pooled_patches(trio, monkeypatch)
 
 
-def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
+def test_the_pipeline_maps_with_the_trio_that_one_parameter_names(directory, monkeypatch):
     map_by_name("clip_dinoiser", directory, 512, monkeypatch)

@@ -1,4 +1,4 @@
-"""The paper's pair ``clip_dinoiser``: CLIP's features, pooled where CLIP-DINOiser sees one object; d = 512.
+"""The paper's trio ``clip_dinoiser``: CLIP's features, pooled where CLIP-DINOiser sees one object; d = 512.
 
 CLIP is OpenCLIP's ViT-B/16, trained on LAION-2B (package ``open_clip``, MIT); the heads are those of Wysoczanska et al. 2024
 (Apache-2.0). Which files are needed stands in :mod:`fus3dmaps_core.encoders.clip_dinoiser.published`. ``encoder.weights``
@@ -14,13 +14,14 @@ from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.clip_dinoiser.network import MEAN, STD, ClipCrops, ClipDinoiser, load_clip, load_heads
 from fus3dmaps_core.encoders.clip_dinoiser.published import CLIP, HEADS
 from fus3dmaps_core.encoders.clip_dinoiser.text import ClipTextEncoder
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 
 CARD = EncoderCard(
     name="clip_dinoiser",
-    summary="The paper's lighter pair: CLIP ViT-B/16, its patches pooled by DINOiser's heads.",
+    summary="The paper's lighter trio: CLIP ViT-B/16, its patches pooled by DINOiser's heads.",
     dimension=512,
     variance_ratio=5.0,  # [sec: Vision Models]
     patch_px=16,
@@ -81,3 +82,6 @@ def make_trio(clip: Any, heads: DinoiserHeads, device: str, crop_padding: float)
         ),
         text=ClipTextEncoder(clip, device),
     )
+
+
+ENCODER = EncoderDefinition(CARD, load_trio, load_text_encoder)

@@ -1,4 +1,4 @@
-"""The networks of the pair: built as published, and the one that turns images into patch embeddings."""
+"""The networks of the trio: built as published, and the one that turns images into patch embeddings."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class ClipCrops(nn.Module):
 
 
 def build_clip() -> Any:
-    """The CLIP model of the pair with random weights, on the CPU.
+    """Build the CLIP model of the trio with random weights, on the CPU.
 
     Raises:
         EncoderError: The package ``open_clip`` is missing.

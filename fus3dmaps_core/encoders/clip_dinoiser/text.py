@@ -19,7 +19,7 @@ class ClipTextEncoder:
     """Embeds prompts with CLIP-DINOiser's templates: 80 sentences each, whose unit embeddings are averaged.
 
     Attributes:
-        space: Name of the pair.
+        space: Name of the trio.
     """
 
     space = "clip_dinoiser"

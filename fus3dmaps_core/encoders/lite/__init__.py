@@ -12,6 +12,7 @@ Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.pa
 from __future__ import annotations
 
 from fus3dmaps_core.encoders.cards import EncoderCard, ShippedFile
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
 from fus3dmaps_core.encoders.lite.detector import shared_detector
@@ -99,3 +100,6 @@ def _check_no_weights(weights: str) -> None:
         raise EncoderError(
             f"parameter 'encoder.weights': encoder 'lite' has no weights but those of its pip packages, got '{weights}'"
         )
+
+
+ENCODER = EncoderDefinition(CARD, load_trio, load_text_encoder)

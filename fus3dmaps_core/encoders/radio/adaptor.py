@@ -77,7 +77,7 @@ def load_head(checkpoint: Checkpoint, name: str, checkout: Path, encoder: str) -
         checkpoint: Read before.
         name: Name of the teacher.
         checkout: RADIO's code.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The checkpoint has no such teacher, or its head is not as it should be.

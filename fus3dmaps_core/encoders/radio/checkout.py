@@ -44,7 +44,7 @@ def find_checkout(weights: str, encoder: str) -> Path:
     Args:
         weights: ``encoder.weights``. Where it is a directory with a folder ``RADIO``, that is the checkout; otherwise the
             pinned revision is taken from the cache of ``torch.hub``, or fetched into it.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: A package is missing, or there is no checkout and none can be fetched; the message says what to
@@ -77,7 +77,7 @@ def import_from(checkout: Path, name: str, encoder: str) -> ModuleType:
     Args:
         checkout: Directory as of :func:`find_checkout`.
         name: Dotted name of the module below the checkout.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: It cannot be imported, or another checkout or package of the same name was imported before.

@@ -47,7 +47,7 @@ def read_checkpoint(path: Path, checkout: Path, encoder: str) -> Checkpoint:
     Args:
         path: A checkpoint as RADIO's authors publish them.
         checkout: RADIO's code, see :mod:`fus3dmaps_core.encoders.radio.checkout`.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The file is damaged, holds Python objects, is no RADIO checkpoint, or lacks weights.

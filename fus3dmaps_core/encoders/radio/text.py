@@ -1,4 +1,4 @@
-"""Text encoders of the RADIO pairs: the towers of the teachers whose spaces their heads imitate."""
+"""Text encoders of the trios on RADIO: the towers of the teachers whose spaces their heads imitate."""
 
 from __future__ import annotations
 

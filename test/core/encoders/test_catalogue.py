@@ -41,7 +41,7 @@ def a_bare_machine(tmp_path, monkeypatch):
 def a_card(**values) -> EncoderCard:
     plain = {
         "name": "a",
-        "summary": "A pair.",
+        "summary": "A trio.",
         "dimension": 8,
         "variance_ratio": 1.0,
         "patch_px": 16,

@@ -1,4 +1,4 @@
-"""Pairs with random weights, a short recording, and the maps that the pairs make of it without ROS."""
+"""Trios with random weights, a short recording, and the maps that the trios make of it without ROS."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SETTINGS = {
     "segmenter.max_masks": 2,
     "node.service_timeout_s": 120.0,
 }
-"""What all pairs are given: small images, and few crops of them."""
+"""What all trios are given: small images, and few crops of them."""
 
 
 @pytest.fixture(scope="session")
@@ -52,12 +52,12 @@ def maps(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def parameters(maps) -> Callable[[str], dict[str, object]]:
-    """Every parameter of a node or pipeline with the pair of a name."""
+    """Every parameter of a node or pipeline with the trio of a name."""
 
-    def of_pair(name: str) -> dict[str, object]:
+    def of_trio(name: str) -> dict[str, object]:
         return {**SETTINGS, "node.map_directory": str(maps), "encoder.name": name}
 
-    return of_pair
+    return of_trio
 
 
 @pytest.fixture
