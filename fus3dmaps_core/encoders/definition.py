@@ -11,7 +11,7 @@ from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 
 @dataclass(frozen=True)
 class EncoderDefinition:
-    """What a module of the registry offers under the name ``ENCODER``.
+    """The definition of a trio, which its module offers the registry under the name ``ENCODER``.
 
     Attributes:
         card: What there is to know about the trio without loading it.

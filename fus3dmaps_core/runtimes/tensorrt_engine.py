@@ -22,8 +22,8 @@ def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path, workspace
     Args:
         tensorrt: The package.
         path: ONNX file; weights outside of it are found beside it.
-        timing_cache: File of what kernels took in earlier builds on this GPU, by which later ones are faster; it is made, or
-            brought up to date.
+        timing_cache: File with the times that kernels took in earlier builds on this GPU, which make later builds faster;
+            it is made or updated.
         workspace_mib: See :data:`WORKSPACE_MIB`.
 
     Returns:
@@ -60,7 +60,7 @@ def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path, workspace
 
 
 def load_engine(tensorrt: ModuleType, plan: bytes) -> Any | None:
-    """An engine from its serialised form; None where TensorRT refuses it, being of another version or GPU, or damaged."""
+    """Load a serialised engine; None where TensorRT refuses it as damaged, or of another version or GPU."""
     return tensorrt.Runtime(_logger(tensorrt)).deserialize_cuda_engine(plan)
 
 

@@ -19,7 +19,7 @@ from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB
 
 
 class TensorRTNetwork:
-    """Images in, one or several tensors out, as the engine says. Safe to use from several threads, one at a time runs.
+    """Images in, one or several tensors out, as the engine says. Safe to use from several threads; one runs at a time.
 
     Nothing passes through the host: inputs and outputs are torch's own memory, and the work is queued in torch's current
     stream, after what is queued there for the images and before what will be for the outputs.
@@ -36,7 +36,7 @@ class TensorRTNetwork:
             tensorrt: The package.
             engine: An ``ICudaEngine`` with one input and static shapes, all tensors float32.
             device: CUDA device that it was built on.
-            name: Of the graph, for messages.
+            name: Name of the graph, for messages.
 
         Raises:
             EncoderError: It is another kind of engine, or there is no memory for it.
@@ -93,14 +93,17 @@ class TensorRTNetwork:
 def engine_of(
     path: Path, device: str, precision: Precision, directory: Path, workspace_mib: int = WORKSPACE_MIB
 ) -> tuple[TensorRTNetwork, Path]:
-    """The engine of an ONNX file as a network, and its file; it is built where there is none yet, which takes minutes.
+    """Open the engine of an ONNX file as a network; build it first where there is none, which takes minutes.
 
     Args:
         path: ONNX file with one float32 input of static shape and float32 outputs.
         device: CUDA device.
-        precision: Of the graph.
+        precision: Precision of the graph.
         directory: Where engines are kept; made if it is missing.
         workspace_mib: See :data:`fus3dmaps_core.runtimes.tensorrt_engine.WORKSPACE_MIB`.
+
+    Returns:
+        The network, and the file of its engine.
 
     Raises:
         EncoderError: The device is no CUDA device, TensorRT is missing, or the engine cannot be built or kept.
@@ -113,7 +116,7 @@ def engine_of(
 
 
 def check_cuda(device: str) -> None:
-    """See that a device is one that TensorRT runs on.
+    """Check that TensorRT runs on a device.
 
     Raises:
         EncoderError: It is no CUDA device.

@@ -50,19 +50,19 @@ class Box:
 
 
 def surface_points(voxels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A point on the surface in each of a box's voxels: (n, 3) metres."""
+    """Pick a point on the surface in each of a box's voxels: (n, 3) metres."""
     return np.asarray((voxels + _FACE_OFFSET) * VOXEL_SIZE_M, np.float64)
 
 
 def voxels_of(points_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Voxel of each point (n, 3): floor(p / size) per axis."""
+    """Compute the voxel of each point (n, 3): floor(p / size) per axis."""
     return np.floor(points_m / VOXEL_SIZE_M).astype(np.int64)
 
 
 def cast_rays(
     boxes: list[Box], origin_m: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """First hit of each ray.
+    """Find the first hit of each ray.
 
     Args:
         boxes: What can be hit; the origin lies inside every room among them and outside all else.

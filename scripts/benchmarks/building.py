@@ -1,4 +1,4 @@
-"""A furnished building without end: rooms on a square grid, numbered outwards from the first."""
+"""An endless furnished building: rooms on a square grid, numbered outwards from the first."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Room:
     boxes: list[Box]
 
     def voxels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Distinct voxels of all surfaces, (n, 3) int64 in order of their indices, and the label of each, (n,) int64."""
+        """List the distinct voxels of all surfaces, (n, 3) int64 ordered by index, and the label of each, (n,) int64."""
         parts = [box.voxels() for box in self.boxes]
         voxels, first = np.unique(np.concatenate([part[0] for part in parts]), axis=0, return_index=True)
         return voxels, np.concatenate([part[1] for part in parts])[first]
@@ -44,7 +44,7 @@ def _places(rooms: int) -> NDArray[np.int64]:
 
 
 def make_room(number: int, seed: int) -> Room:
-    """Room ``number`` of the building that the seed stands for; room 0 has a corner at the origin."""
+    """Make room ``number`` of the building that the seed stands for; room 0 has a corner at the origin."""
     rng = np.random.default_rng([seed, number])
     column, row = _places((2 * int(np.ceil(np.sqrt(number + 1))) + 1) ** 2)[number]
     size = np.array(_ROOM_VOXELS)

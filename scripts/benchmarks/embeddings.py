@@ -14,13 +14,13 @@ NOISE = 0.75
 
 
 def unit_vectors(count: int, dimension: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Random directions, (count, dimension) float32."""
+    """Draw random directions, (count, dimension) float32."""
     vectors = rng.standard_normal((count, dimension), np.float32)
     return np.asarray(vectors / np.linalg.norm(vectors, axis=1, keepdims=True))
 
 
 class ObservedObjects:
-    """Observations of objects: cheap to make, for both parts come from tables."""
+    """Observations of objects; cheap to make, since both parts come from tables."""
 
     def __init__(self, dimension: int, seed: int) -> None:
         """Draw the tables.
@@ -34,7 +34,7 @@ class ObservedObjects:
         self._noise = unit_vectors(_NOISES, dimension, self._rng) * np.float32(NOISE)
 
     def observe(self, objects: NDArray[np.int64]) -> NDArray[np.float32]:
-        """One observation of each object: (n, d) float32, not of unit length."""
+        """Draw one observation of each object: (n, d) float32, not of unit length."""
         noise = self._noise[self._rng.integers(0, _NOISES, len(objects))]
         return np.asarray(self.directions[objects % _DIRECTIONS] + noise)
 
@@ -43,7 +43,7 @@ class KnownText:
     """A text encoder that answers every prompt with one vector.
 
     Attributes:
-        space: That of maps which do not say whose embeddings they hold.
+        space: Empty, as in maps that do not say whose embeddings they hold.
     """
 
     space = ""
@@ -53,5 +53,5 @@ class KnownText:
         self._vector = vector
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
-        """The vector once per prompt: (n, d)."""
+        """Return the vector once per prompt: (n, d)."""
         return np.repeat(self._vector[None], len(prompts), axis=0)

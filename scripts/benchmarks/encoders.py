@@ -66,7 +66,7 @@ def bench(
     threads: Annotated[int, typer.Option(help="Threads; 0 takes one for each usable core.")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="File that the figures are written to.")] = None,
 ) -> int:
-    """Size, work, time and memory of each vision model at a frame's size; one table, JSON beside it on request.
+    """Measure size, work, time and memory of each vision model at a frame's size; one table, JSON beside it on request.
 
     Random weights are made in a scratch directory (TMPDIR), up to 3 GB at once, and are gone afterwards.
     """
@@ -140,7 +140,7 @@ def measure_apart(job: Job) -> dict[str, Any]:
 
 
 def _needs_preparing(job: Job) -> bool:
-    """Whether there are weights to be made or looked for, or graphs to be exported."""
+    """Tell whether there are weights to be made or looked for, or graphs to be exported."""
     if job.kind == "segmenter":
         return job.random and job.name == "sam2"
     return job.name != "lite" or job.runtime in EXPORTING
@@ -162,7 +162,7 @@ def _run(task: str, job: Job) -> dict[str, Any]:
 
 
 def _weights_of(name: str, weights: str) -> str:
-    """Value of ``encoder.weights`` or ``segmenter.weights`` for a model."""
+    """Return the value of ``encoder.weights`` or ``segmenter.weights`` for a model."""
     if weights in (_RANDOM, _INSTALLED) or name == "lite":  # Which pip brings.
         return ""
     folder = Path(weights).resolve()

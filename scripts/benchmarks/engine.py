@@ -41,7 +41,7 @@ class Run:
         backend: Which kernels the maps use; None leaves the choice to the map.
         threads: Threads of torch and of compiled code.
         repeats: Rounds over the keyframes, and timed calls of what has no keyframe.
-        say: Told what is being done.
+        say: Called with what is being done.
     """
 
     world: World
@@ -52,12 +52,12 @@ class Run:
     say: Callable[[str], None]
 
     def new_map(self, dimension: int, dtype: str, window_radius_m: float = 0.0) -> SemanticMap:
-        """An empty map."""
+        """Make an empty map."""
         values = {"dtype": dtype, "device": self.device} | ({"backend": self.backend} if self.backend else {})
         return SemanticMap(dimension, MapConfig.model_validate(values), _VARIANCE_RATIO, window_radius_m)
 
     def params(self, voxels: int, dimension: int, dtype: str, **further: Any) -> dict[str, Any]:
-        """The params of a measurement."""
+        """Return the params of a measurement."""
         shared = {"device": self.device, "backend": self.backend or "default", "threads": self.threads}
         return {"map_voxels": voxels, "d": dimension, "dtype": dtype, **further, **shared}
 
@@ -69,7 +69,7 @@ class FilledMap:
         """Fill a map.
 
         Args:
-            run: Of which run.
+            run: The run that the map belongs to.
             voxels: How many voxels it gets.
             dimension: Embedding width d.
             dtype: Storage type.
@@ -84,25 +84,25 @@ class FilledMap:
         fill(self.map, run.world, voxels, self.instances, self.observed)
 
     def params(self, **further: Any) -> dict[str, Any]:
-        """The params of a measurement of this map."""
+        """Return the params of a measurement of this map."""
         return self.run.params(self.voxels, self.dimension, self.dtype, **further)
 
     def forget_fresh(self, keyframe: DenseKeyframe) -> None:
-        """Bring the map to where it was before the robot saw what is new in the keyframe."""
+        """Remove from the map what the keyframe is the first to see."""
         self.map.remove_voxels(keyframe.fresh_points_m)
 
     def update_dense(self, keyframe: DenseKeyframe, embeddings: NDArray[np.float32]) -> None:
-        """One dense update."""
+        """Run one dense update."""
         weights = np.ones(len(embeddings), np.float32)
         self.map.integrate_dense(keyframe.points_m, keyframe.patches, embeddings, weights, keyframe.colors)
 
     def update_instances(self, keyframe: ProposalKeyframe, embeddings: NDArray[np.float32]) -> NDArray[np.int64]:
-        """One instance update."""
+        """Run one instance update."""
         return self.map.integrate_proposals(keyframe.points_m, keyframe.proposals, embeddings)
 
 
 def measure_dense_updates(maps: Sequence[FilledMap], keyframes: Sequence[DenseKeyframe]) -> list[Measurement]:
-    """dense_update: one keyframe into the dense layer, a twentieth of its voxels new to the map."""
+    """Measure dense_update: one keyframe into the dense layer, a twentieth of its voxels new to the map."""
     samples: list[list[float]] = [[] for _ in maps]
     run = maps[0].run
     embeddings = [maps[0].observed.observe(keyframe.patch_objects) for keyframe in keyframes]
@@ -123,7 +123,7 @@ def measure_dense_updates(maps: Sequence[FilledMap], keyframes: Sequence[DenseKe
 
 
 def measure_instance_updates(maps: Sequence[FilledMap], keyframes: Sequence[ProposalKeyframe]) -> list[Measurement]:
-    """instance_update: association and update of all proposals of a keyframe, on maps that differ in instances alive."""
+    """Measure instance_update: all proposals of a keyframe, on maps that differ in instances alive."""
     samples: list[list[float]] = [[] for _ in maps]
     known = [0 for _ in maps]
     run = maps[0].run
@@ -159,7 +159,7 @@ def measure_instance_updates(maps: Sequence[FilledMap], keyframes: Sequence[Prop
 def measure_fusion(
     filled: FilledMap, keyframes: Sequence[DenseKeyframe], masks: Sequence[ProposalKeyframe]
 ) -> list[Measurement]:
-    """full_fusion of a map that changed, its bandwidth, and incremental_fusion after one more keyframe of both kinds."""
+    """Measure full_fusion of a changed map, its bandwidth, and incremental_fusion after one more keyframe of both kinds."""
     run = filled.run
 
     def keyframe_before(index: int) -> None:
@@ -178,7 +178,7 @@ def measure_fusion(
 
 
 def measure_queries(filled: FilledMap) -> Iterator[Measurement]:
-    """text_query: one prompt asked of each layer of a fused map, whole answer included, but for encoding the text."""
+    """Measure text_query: one prompt asked of each layer of a fused map, with the whole answer but without encoding it."""
     filled.map.fuse()
     text = KnownText(filled.observed.directions[7])
     for layer in LAYERS:
@@ -191,7 +191,7 @@ def measure_queries(filled: FilledMap) -> Iterator[Measurement]:
 
 
 def measure_memory(filled: FilledMap) -> list[Measurement]:
-    """dense_bytes_per_voxel (keys, hash, weights, embeddings) and instance_bytes (instances and all hypotheses)."""
+    """Measure dense_bytes_per_voxel (keys, hash, weights, embeddings) and instance_bytes (instances and all hypotheses)."""
     held = filled.map.nbytes()
     dense, instances = filled.map.dense_voxel_count, filled.map.instance_count
     return [
@@ -201,11 +201,11 @@ def measure_memory(filled: FilledMap) -> list[Measurement]:
 
 
 def instance_levels(voxels: int, wanted: Sequence[int]) -> list[int]:
-    """Those numbers of instances that a map of this size has room for."""
+    """Return the numbers of instances that a map of this size has room for."""
     return [level for level in wanted if level * _MIN_VOXELS_PER_INSTANCE <= voxels]
 
 
 def _bandwidth(name: str, filled: FilledMap, times: Times, further: dict[str, Any]) -> Measurement:
-    """GB/s over the bytes of the dense rows: dense voxels x d x bytes of an element."""
+    """Compute GB/s over the bytes of the dense rows: dense voxels x d x bytes of an element."""
     size = filled.map.dense_voxel_count * filled.dimension * ELEMENT_BYTES[filled.dtype]
     return Measurement(name, filled.params(**further), size / times.median_ms / 1e6, "GB/s")

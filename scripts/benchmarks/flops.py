@@ -1,4 +1,4 @@
-"""Arithmetic of a network, counted while it runs in torch or read from an ONNX file; 2 for a product and its sum."""
+"""The arithmetic of a network, counted while it runs in torch or read from an ONNX file; 2 for a product and its sum."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DETECTOR_INPUT = (1, 3, 300, 300)
 
 
 def count_flops(network: Callable[[torch.Tensor], object], images: torch.Tensor) -> int:
-    """Floating-point operations of convolutions, matrix products and attention in one pass.
+    """Count the floating-point operations of convolutions, matrix products and attention in one pass.
 
     Attention is computed step by step here: the counter does not know all of the fused kernels, and leaves out the work of
     those that it does not know.
@@ -43,7 +43,7 @@ def count_flops(network: Callable[[torch.Tensor], object], images: torch.Tensor)
 
 
 def count_onnx(path: Path) -> tuple[int, int]:
-    """Weights and floating-point operations of an ONNX file of static shapes.
+    """Count the weights and floating-point operations of an ONNX file of static shapes.
 
     Args:
         path: The file.
@@ -77,7 +77,7 @@ def _flops_of(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
 
 
 def count_detector() -> tuple[int, int]:
-    """Weights of the detector of ``lite``, and floating-point operations of its convolutions on one image.
+    """Count the weights of the detector of ``lite``, and the floating-point operations of its convolutions on one image.
 
     Raises:
         EncoderError: The package that brings it is missing or altered.

@@ -24,7 +24,7 @@ class Measurement:
 
     Attributes:
         name: What was measured.
-        params: Of what; map_voxels, d and dtype wherever they apply.
+        params: What it was measured of; map_voxels, d and dtype wherever they apply.
         value: The figure, a median where there are samples.
         unit: Its unit; "1" for a ratio.
         spread: Smallest, quartiles, largest and number of the samples, in the same unit; empty without samples.
@@ -37,13 +37,13 @@ class Measurement:
     spread: Mapping[str, float] = field(default_factory=dict)
 
     def as_json(self) -> dict[str, Any]:
-        """The figure as an entry of the JSON file."""
+        """Return the figure as an entry of the JSON file."""
         entry = {"name": self.name, "params": dict(self.params), "value": self.value, "unit": self.unit}
         return {**entry, "spread": dict(self.spread)} if self.spread else entry
 
 
 def timed(name: str, params: Mapping[str, Any], times: Times) -> Measurement:
-    """A measurement in milliseconds."""
+    """Make a measurement in milliseconds."""
     return Measurement(name, params, times.median_ms, "ms", spread(times.samples_ms))
 
 

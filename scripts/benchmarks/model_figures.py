@@ -1,4 +1,4 @@
-"""What is said of a vision model, and the means to find it out."""
+"""The figures of a vision model, and helpers to measure them."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class Job:
         device: Torch device.
         runtime: ``encoder.runtime``.
         precision: ``encoder.precision``, of TensorRT engines.
-        threads: Of torch.
-        height: Of a frame, pixels.
-        width: Likewise.
+        threads: Threads of torch.
+        height: Height of a frame, pixels.
+        width: Its width, pixels.
         repeats: Samples of a figure, at most.
         budget_s: What the samples of a figure may take together, about, seconds.
         weights: ``encoder.weights`` or ``segmenter.weights``.
-        random: Whether random weights are to be made; ``weights`` then is of no account until they are.
+        random: Whether random weights are to be made; ``weights`` is ignored until they are.
         folder: Scratch directory of this model alone.
         code: Whose code builds the network: ``installed``, or for RADIO's beside random weights ``RADIO's own`` or
             ``stand-in``.
@@ -58,7 +58,7 @@ class Job:
 
     @property
     def encoder(self) -> EncoderConfig:
-        """How encoders and segmenters are run; graphs and engines lie in the scratch directory."""
+        """The settings that encoders and segmenters are run with; graphs and engines lie in the scratch directory."""
         return EncoderConfig(
             name=self.name if self.kind == "trio" else "lite",
             device=self.device,
@@ -73,9 +73,9 @@ class Seconds:
     """What a call takes.
 
     Attributes:
-        best: Of the samples, seconds.
-        median: Likewise.
-        samples: How many.
+        best: Shortest of the samples, seconds.
+        median: Median of the samples, seconds.
+        samples: Number of samples.
     """
 
     best: float
@@ -84,42 +84,42 @@ class Seconds:
 
     @classmethod
     def of(cls, samples_s: Iterable[float], share: float = 1.0) -> Seconds:
-        """From samples, each times a share, e.g. one over the size of a batch."""
+        """Summarise samples, each times a share, e.g. one over the size of a batch."""
         values = [share * sample for sample in samples_s]
         return cls(min(values), float(np.median(values)), len(values))
 
 
 @dataclass(frozen=True)
 class ModelFigures:
-    """One model.
+    """The figures of one model.
 
     Attributes:
         kind: ``trio`` or ``segmenter``.
         name: Registry name, of a segmenter from a file with the file's.
         device: Torch device.
         runtime: What ran the image networks.
-        precision: Of their weights.
-        threads: Of torch.
+        precision: Precision of their weights.
+        threads: Threads of torch.
         weights: ``random``, or where they came from.
         code: Whose code built the network, as in :class:`Job`.
         image_size: Height and width of a frame, pixels.
-        image_parameters: Of all networks that see images, each counted once; None where it has none.
-        text_parameters: Of the text tower.
+        image_parameters: Weights of all networks that see images, each counted once; None where it has none.
+        text_parameters: Weights of the text tower.
         dimension: Embedding width d.
         frame_input: Shape of what the frame's network takes, (n, 3, H, W).
-        crop_input: Of what the crops' network takes at once.
+        crop_input: Shape of what the crops' network takes at once.
         patch_grid: Rows and columns.
         frame_gflop: 10^9 floating-point operations of a frame, 2 for a product and its sum.
-        crop_gflop: Of a crop.
+        crop_gflop: The same of a crop.
         load_s: Loading from files that the page cache holds, seconds.
         prepare_s: Opening the runtime after that, compilation included, seconds; 0 for torch.
-        first_frame_s: The first frame, which warms up.
-        frame: A frame.
-        crop: A crop, in a batch of so many.
+        first_frame_s: Time of the first frame, which warms up, seconds.
+        frame: Time of a frame.
+        crop: Time of a crop, in a batch of ``crop_batch``.
         crop_batch: How many crops were embedded at once.
-        prompt: A prompt, in all of its sentences.
+        prompt: Time of a prompt, in all of its sentences.
         prompt_sentences: Sentences that a prompt is embedded in.
-        prompt_measured_sentences: So many were timed, and the time of a prompt was worked out from theirs.
+        prompt_measured_sentences: How many of them were timed; the time of a prompt is worked out from theirs.
         loaded_resident_bytes: Resident memory of the process after loading, interpreter and libraries included.
         peak_resident_bytes: The most that it was.
         peak_device_bytes: The most that torch held on a CUDA device; None elsewhere.
@@ -159,13 +159,13 @@ class ModelFigures:
 
 
 def seconds(call: Callable[[], object], device: str) -> float:
-    """Time of one call with the device's work in it, seconds."""
+    """Time one call with the device's work in it, seconds."""
     gc.collect()
     return time_call(call, device) / 1000.0
 
 
 def sample(call: Callable[[int], object], first_s: float, job: Job) -> list[float]:
-    """Times of call(1), call(2), ... as far as repeats and budget of the job go, seconds.
+    """Time call(1), call(2), ... as far as repeats and budget of the job go, seconds.
 
     Args:
         call: What is timed.
@@ -179,12 +179,12 @@ def sample(call: Callable[[int], object], first_s: float, job: Job) -> list[floa
 
 
 def parameters_of(modules: Iterable[nn.Module]) -> dict[int, int]:
-    """Elements of each weight by its identity, so that what modules share counts once."""
+    """Count the elements of each weight by its identity, so that what modules share counts once."""
     return {id(weight): weight.numel() for module in modules for weight in module.parameters()}
 
 
 def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
-    """Modules that an object's attributes hold, or theirs in turn."""
+    """Find the modules in an object's attributes, and in theirs in turn."""
     if isinstance(value, nn.Module):
         return [value]
     if depth == 0 or not hasattr(value, "__dict__"):
@@ -193,7 +193,7 @@ def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
 
 
 def resident_bytes(field: str) -> int:
-    """Resident memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
+    """Read the resident memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
 
     The peak that getrusage tells is inherited from the parent.
     """
@@ -205,7 +205,7 @@ def resident_bytes(field: str) -> int:
 
 
 def device_bytes(device: str) -> tuple[int | None, int | None]:
-    """The most that torch held on a CUDA device, and what is in use on it now; None and None elsewhere."""
+    """Return the most that torch held on a CUDA device, and what is in use on it now; None and None elsewhere."""
     if torch.device(device).type != "cuda":
         return None, None
     free, total = torch.cuda.mem_get_info(device)
@@ -213,6 +213,6 @@ def device_bytes(device: str) -> tuple[int | None, int | None]:
 
 
 def precision_of(module: nn.Module) -> str:
-    """Precision of a network's weights, e.g. ``float32``."""
+    """Return the precision of a network's weights, e.g. ``float32``."""
     dtype = next(value.dtype for value in module.state_dict().values() if value.is_floating_point())
     return str(dtype).removeprefix("torch.")

@@ -32,7 +32,7 @@ REFUSED = 2
 
 
 def main(task: str, job_file: Path, result: Path) -> int:
-    """Prepare or measure a model; returns the exit code."""
+    """Prepare or measure a model, and return the exit code."""
     job = Job(**json.loads(job_file.read_text()))
     torch.set_num_threads(job.threads)
     cv2.setNumThreads(job.threads)
@@ -81,7 +81,7 @@ def _measure(job: Job) -> dict[str, Any]:
 
 
 def cpu_seconds() -> tuple[float, float, float]:
-    """Time of all cores since the start of the machine, their busy time, and this process's with its children, seconds."""
+    """Read the time of all cores since boot, their busy time, and this process's with its children, seconds."""
     ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
     idle = ticks[3] + ticks[4]
     per_second = os.sysconf("SC_CLK_TCK")
@@ -89,7 +89,7 @@ def cpu_seconds() -> tuple[float, float, float]:
 
 
 def view(height: int, width: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """A frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
+    """Make a frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
     frame = FurnishedRoom().frame(_VIEW)
     rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)

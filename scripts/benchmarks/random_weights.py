@@ -76,7 +76,7 @@ def write_sam2(folder: Path) -> str:
 
 
 def radio_code() -> str:
-    """Whose code builds RADIO's networks beside random weights: its authors' or that of the tests."""
+    """Say whose code builds RADIO's networks for random weights: its authors' or that of the tests."""
     files = _helper("radio_files")
     return "stand-in" if files.find_checkout() == files.STAND_IN else "RADIO's own"
 
@@ -108,7 +108,7 @@ def _write_clip_dinoiser(folder: Path) -> None:
 
 
 def _helper(name: str) -> Any:
-    """A module of the tests' folder, which scripts/bench has on the path."""
+    """Import a module of the tests' folder, which scripts/bench has on the path."""
     return import_module(name)
 
 
@@ -119,7 +119,7 @@ TRIOS: dict[str, Callable[[Path], None]] = {
     "radseg": partial(_write_radio, "radseg"),
     "siglip2": _write_siglip2,
 }
-"""What writes random weights of each trio into an empty directory."""
+"""Functions that write random weights of each trio into an empty directory."""
 
 
 def _replace(module: str, name: str, change: Callable[[Any], Any]) -> None:

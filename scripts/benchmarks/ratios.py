@@ -1,4 +1,4 @@
-"""What the figures of a run say of each other."""
+"""Ratios between the figures of a run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SAME_INPUT = ("map_voxels", "d", "points", "keyframes")
 
 
 def ratios(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """Largest over smallest map, most over fewest instances, RayFronts over ours, and shares of the copy's bandwidth."""
+    """Compare largest and smallest map, most and fewest instances, RayFronts and ours, and bandwidth and a plain copy's."""
     return [
         *_across(measurements, "dense_update", "map_voxels", ("points", "keyframes")),
         *_across(measurements, "instance_update", "instances", ("map_voxels", "masks")),
@@ -22,7 +22,7 @@ def ratios(measurements: Sequence[Measurement]) -> list[Measurement]:
 
 
 def _across(measurements: Iterable[Measurement], name: str, varied: str, fixed: tuple[str, ...]) -> Iterator[Measurement]:
-    """Figures at the largest over those at the smallest value of a param, for each setting of the others."""
+    """Divide figures at the largest by those at the smallest value of a param, for each setting of the others."""
     groups: dict[tuple[Any, ...], list[Measurement]] = {}
     for measurement in _named(measurements, name):
         groups.setdefault(tuple(measurement.params[key] for key in (*_SETTING, *fixed)), []).append(measurement)

@@ -73,7 +73,7 @@ def load_map_class(directory: Path) -> type[Any]:
 
 
 def scatter(src: Tensor, index: Tensor, out: Tensor, reduce: str, dim: int) -> Tensor:
-    """What torch_scatter's function of this name does with these arguments, by torch's own scatter_add_.
+    """Do what torch_scatter's function of this name does with these arguments, by torch's own scatter_add_.
 
     Args:
         src: (n, c) values.
@@ -99,7 +99,7 @@ class Peer:
         self.map = map_class(None, device, vox_size=VOXEL_SIZE_M, vox_accum_period=1, windowing=windowed)
 
     def prepare(self, points_m: np.ndarray, features: Tensor, colors: np.ndarray) -> tuple[Tensor, Tensor]:
-        """Points and their rows of colour, features and confidence as its own process_posed_rgbd makes them.
+        """Make points and their rows of colour, features and confidence as its own process_posed_rgbd does.
 
         Its voxels are centred on multiples of their size where ours begin there: half a voxel's shift makes them the same.
         """
@@ -108,7 +108,7 @@ class Peer:
         return xyz, torch.cat((rgb, features, torch.ones((len(xyz), 1), device=self._device)), dim=1)
 
     def update(self, xyz: Tensor, rows: Tensor) -> None:
-        """One keyframe."""
+        """Update the map by one keyframe."""
         self.map._tmp_pc_xyz.append(xyz)
         self.map._tmp_pc_rgb_feat_conf.append(rows)
         self.map.accum_semantic_voxels()
@@ -122,7 +122,7 @@ class Peer:
 def measure_rayfronts(
     run: Run, directory: Path, keyframes: Sequence[DenseKeyframe], sizes: Sequence[int], dimension: int
 ) -> list[Measurement]:
-    """rayfronts_update: one keyframe into its map, in float32 as it stores it, full and windowed."""
+    """Measure rayfronts_update: one keyframe into its map, in float32 as it stores it, full and windowed."""
     map_class = load_map_class(directory)
     observed = ObservedObjects(dimension, run.world.seed)
     measured = []

@@ -39,19 +39,19 @@ _SPARE_BYTES = 2**31
 
 
 def known_dtypes() -> list[str]:
-    """The map's storage types."""
+    """List the map's storage types."""
     return [str(name) for name in get_args(MapConfig.model_fields["dtype"].annotation)]
 
 
 def default_dtype() -> str:
-    """The storage type of a map that names none."""
+    """Return the storage type of a map that names none."""
     return str(MapConfig().dtype)
 
 
 def measure_all(
     run: Run, sizes: Sequence[int], settings: Sequence[tuple[int, str]], rayfronts: Path | None
 ) -> list[Measurement]:
-    """Every case of the map at every setting, the peer's where a checkout is given, and the ratios between all of them.
+    """Measure every case of the map at every setting, the peer's where a checkout is given, and the ratios between them.
 
     Args:
         run: What the cases share.
@@ -77,7 +77,7 @@ def measure_all(
 
 
 def _measure_setting(run: Run, sizes: Sequence[int], dimension: int, dtype: str) -> list[Measurement]:
-    """All cases of the map at one width and storage type."""
+    """Measure all cases of the map at one width and storage type."""
     fitting = _that_fit(run, sizes, dimension, dtype)
     if not fitting:
         return []
@@ -107,7 +107,7 @@ def _measure_setting(run: Run, sizes: Sequence[int], dimension: int, dtype: str)
 
 
 def settings(widths: Sequence[int], types: Sequence[str], quick: bool) -> list[tuple[int, str]]:
-    """Width and storage type of each group of cases."""
+    """List width and storage type of each group of cases."""
     chosen = list(widths) or list(QUICK_DIMENSIONS if quick else DIMENSIONS)
     if types:
         return [(width, dtype) for dtype in types for width in chosen]
@@ -118,7 +118,7 @@ def settings(widths: Sequence[int], types: Sequence[str], quick: bool) -> list[t
 
 
 def _that_fit(run: Run, sizes: Sequence[int], dimension: int, dtype: str) -> list[int]:
-    """The sizes whose maps fit into memory side by side, the smallest first."""
+    """Return the sizes whose maps fit into memory side by side, the smallest first."""
     left = _free_bytes(run.device) - _SPARE_BYTES
     fitting = []
     for size in sorted(sizes):

@@ -35,13 +35,13 @@ class Times:
 
 
 def spread(samples: Sequence[float]) -> dict[str, float]:
-    """Smallest sample, quartiles, largest sample and number of samples."""
+    """Return the smallest sample, quartiles, the largest sample and the number of samples."""
     low, first, third, high = np.percentile(samples, (0, 25, 75, 100))
     return {"min": float(low), "q1": float(first), "q3": float(third), "max": float(high), "samples": len(samples)}
 
 
 def time_call(call: Callable[[], object], device: str = "cpu") -> float:
-    """Time of one call, milliseconds.
+    """Time one call, milliseconds.
 
     The processor's caches are swept first: between two keyframes an encoder's weights have gone through them, so that a map
     small enough to live there would otherwise show a speed that no robot sees.
@@ -105,12 +105,12 @@ def set_threads(threads: int) -> None:
 
 
 def usable_cores() -> int:
-    """Cores that this process may run on."""
+    """Count the cores that this process may run on."""
     return len(os.sched_getaffinity(0))
 
 
 def copy_bandwidth(repeats: int, device: str = "cpu", size_bytes: int = 2**28) -> tuple[float, dict[str, float]]:
-    """What the memory gives: a plain copy of a large buffer by torch's threads.
+    """Measure the bandwidth of the memory: a plain copy of a large buffer by torch's threads.
 
     Memory of a virtual machine may lie near its processors or behind another one, at half the speed, and what the maps get
     is mixed. So several buffers are held side by side and the fastest counts, or shares of it would depend on luck.

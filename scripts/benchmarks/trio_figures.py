@@ -117,7 +117,7 @@ def figures_of(job: Job, rgb: NDArray[np.uint8], trio: EncoderTrio, load_s: floa
 
 
 def _time_crops(job: Job, trio: EncoderTrio, rgb: NDArray[np.uint8], batch: int) -> tuple[list[float], int]:
-    """Seconds of batches of crops of a frame whose patches were embedded before, and how many crops are in a batch.
+    """Time batches of crops of a frame whose patches were embedded before; return seconds, and the crops of a batch.
 
     A full batch of the encoder, or fewer where the budget would not do for two of them, unless the runtime pads them.
     """
@@ -143,7 +143,7 @@ def _boxes(count: int, height: int, width: int) -> Masks:
 
 
 def _time_prompt(job: Job, text: TextEncoder) -> tuple[list[float], int, int]:
-    """Seconds of a prompt, the sentences it is put into, and how many of them were timed.
+    """Time a prompt; return seconds, the sentences it is put into, and how many of them were timed.
 
     Where all of them would take longer than the budget a few are timed and the rest is taken to cost as much.
     """

@@ -58,7 +58,7 @@ class World:
     """The same for every map of a run."""
 
     def __init__(self, max_voxels: int, seed: int) -> None:
-        """Build it.
+        """Build the world.
 
         Args:
             max_voxels: Size of the largest map.
@@ -118,7 +118,7 @@ class World:
 
 
 def instance_labels(surface: Surface, voxels: int, instances: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Instances that together cover a map of the surface's first voxels, two deep for half of them.
+    """Make instances that together cover a map of the surface's first voxels, two deep for half of them.
 
     What the keyframes see is cut into parts of things, the rest evenly into as many pieces as are wanted. Groups of twelve
     neighbours share a half of each with an instance of their own, which overlaps each too little to be taken for it.
@@ -177,7 +177,7 @@ def fill(semantic_map: SemanticMap, world: World, voxels: int, instances: int, o
 
 
 def _first_halves(labels: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
-    """For each member, whether it is in the first half of its label's members."""
+    """Tell for each member whether it is in the first half of its label's members."""
     order = np.argsort(labels, kind="stable")
     sizes = np.bincount(labels, minlength=count)
     rank = np.empty(len(labels), np.int64)
@@ -186,6 +186,6 @@ def _first_halves(labels: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
 
 
 def _keys(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One integer for each voxel of the building, in the order of the indices."""
+    """Make one integer for each voxel of the building, in the order of the indices."""
     shifted = voxels + 2**20
     return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]

@@ -1,12 +1,12 @@
 """The default encoder trio ``lite``: small networks that pip alone brings, for any CPU.
 
 This is ConSE (Norouzi et al. 2013, "Zero-Shot Learning by Convex Combination of Semantic Embeddings"): an ImageNet
-classifier (EfficientNet-Lite0) and a COCO detector (SSD-MobileNet-v2) say which class names a piece of image goes by, and a
+classifier (EfficientNet-Lite0) and a COCO detector (SSD-MobileNet-v2) say which class names fit a piece of an image, and a
 small sentence model (all-MiniLM-L6-v2) embeds these names and the prompts in one space. Its visual vocabulary is bounded by
 those 1000 + 80 names: a prompt is answered through the names nearest to it in meaning. **It is not CLIP**, nor any other
 network trained on images and text together, and what it scores says nothing about the vision-language models of the paper.
 
-Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.packaged_files`. Nothing is ever downloaded.
+:mod:`fus3dmaps_core.encoders.lite.packaged_files` names origin and licence of the weights. Nothing is ever downloaded.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Where the weights come from: files that pip packages ship, found by package and checked by SHA-256.
+"""The weights of ``lite``: files that pip packages ship, found by package and checked by SHA-256.
 
 Nothing is downloaded here and nothing of the packages is imported (one of them fails to import): their files are found
 through the packages' installation records.
@@ -44,7 +44,7 @@ class PackagedFile:
     sha256: str
 
     def locate(self) -> Path:
-        """Path of the file once its hash has been checked.
+        """Find the file and check its hash.
 
         Raises:
             EncoderError: The package is not installed, or its file is missing or altered; the message names the package.

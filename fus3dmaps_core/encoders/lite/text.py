@@ -17,7 +17,7 @@ _BATCH = 64
 
 
 class SentenceModel:
-    """Unit embeddings of sentences. Safe to use from several threads."""
+    """A model of unit embeddings of sentences. Safe to use from several threads."""
 
     def __init__(self, device: str) -> None:
         """Load the model from the files of its pip package, never from a network.

@@ -75,10 +75,10 @@ class RadioVariant:
 
 
 def load_trio(variant: RadioVariant, device: str, crop_padding: float, weights: str) -> EncoderTrio:
-    """Load the three encoders of a variant.
+    """Load the three encoders of a trio.
 
     Args:
-        variant: Which one.
+        variant: The trio to load.
         device: Torch device, e.g. ``cpu`` or ``cuda:0``.
         crop_padding: Padding around a mask's box, as a share of its size.
         weights: ``encoder.weights``: a directory with RADIO's checkpoint, the text tower's two files and, where it is not to
@@ -96,7 +96,7 @@ def load_trio(variant: RadioVariant, device: str, crop_padding: float, weights: 
 
 
 def load_text_encoder(variant: RadioVariant, device: str, weights: str) -> TextEncoder:
-    """Load the text encoder of a variant alone; nothing of RADIO is needed.
+    """Load the text encoder of a trio alone; nothing of RADIO is needed.
 
     Raises:
         EncoderError: As :func:`load_trio`.
@@ -106,7 +106,7 @@ def load_text_encoder(variant: RadioVariant, device: str, weights: str) -> TextE
 
 
 def load_networks(variant: RadioVariant, weights: str) -> tuple[RadioBackbone, SummaryHead]:
-    """RADIO's transformer and the teacher's head with their weights, on the CPU in float32.
+    """Load RADIO's transformer and the teacher's head with their weights, on the CPU in float32.
 
     Raises:
         EncoderError: As :func:`load_trio`.
@@ -134,10 +134,10 @@ def make_trio(
     crop_padding: float,
     dtype: torch.dtype = torch.float32,
 ) -> EncoderTrio:
-    """The three encoders over given networks.
+    """Make the three encoders from loaded networks.
 
     Args:
-        variant: Whose.
+        variant: The trio to make.
         backbone: RADIO's transformer.
         head: The teacher's head.
         text: Text encoder of the teacher's space.

@@ -8,7 +8,7 @@ from fus3dmaps_core.encoders.weights import find_weights, only_directory, saying
 
 
 def load_text(published: TextTower, weights: str, device: str, encoder: str) -> SiglipTextEncoder:
-    """A published text tower with its weights, or those in the directory that ``encoder.weights`` names.
+    """Load a text tower, with its published weights or those in the directory that ``encoder.weights`` names.
 
     Raises:
         EncoderError: A package, the weights or the tokenizer are missing, damaged or another model's.

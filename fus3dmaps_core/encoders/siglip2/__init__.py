@@ -1,9 +1,9 @@
 """The small trio ``siglip2``: SigLIP 2 B/16 alone, whose pooling head also takes each patch by itself; d = 768.
 
 It is the trio for Jetson Orin Nano: one transformer of 93 million parameters embeds patches and crops, weights and code are
-Apache-2.0 (Tschannen et al. 2025). Which files are needed stands in
-:mod:`fus3dmaps_core.encoders.siglip2.published`. ``encoder.weights`` is a directory that holds both, or the model's file or
-repository of the hub; the tokenizer then is the published one, which all of SigLIP 2's models have.
+Apache-2.0 (Tschannen et al. 2025). :mod:`fus3dmaps_core.encoders.siglip2.published` lists the files that are needed.
+``encoder.weights`` is a directory that holds both, or the model's file or repository of the hub; the tokenizer then is the
+published one, which all of SigLIP 2's models have.
 
 The published model was trained on images of 384 pixels, 24x24 patches. Its positions are stretched to the 30x40 of a frame
 of 480x640, and a crop costs half as much as with the model for 512 pixels, for half a point less of zero-shot accuracy on
@@ -87,7 +87,7 @@ def load_text_encoder(device: str, weights: str) -> TextEncoder:
 def make_trio(
     tokens: SiglipTokens, text: TextEncoder, device: str, crop_padding: float, dtype: torch.dtype = torch.float32
 ) -> EncoderTrio:
-    """The three encoders over given networks.
+    """Make the three encoders from loaded networks.
 
     Args:
         tokens: Image tower.
@@ -109,7 +109,7 @@ def make_trio(
 
 
 def _find_files(weights: str) -> tuple[Path, Path]:
-    """Paths of the model and of the tokenizer."""
+    """Find the files of the model and of the tokenizer."""
     for package in CARD.packages:  # Before gigabytes are fetched.
         import_optional(package, CARD.name)
     model = find_weights(_PARAMETER, weights, MODEL)

@@ -1,4 +1,4 @@
-"""Masks of everything in a frame, by FastSAM's network and our own work before and after it."""
+"""Masks of everything in a frame, by FastSAM's network with pre- and post-processing of our own."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
 
 
 class FastSamSegmenter:
-    """Proposes masks at the image's own size, best first. As safe to use from several threads as its network."""
+    """FastSAM's segmenter: masks at the image's own size, best first. As safe to use from several threads as its network."""
 
     def __init__(self, network: Network, shape: tuple[int, int], device: str) -> None:
         """Keep the network.
