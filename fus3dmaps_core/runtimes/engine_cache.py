@@ -13,7 +13,7 @@ import torch
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.cached_files import graph_hash, slug, write_atomically
-from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB, build_engine, load_engine
+from fus3dmaps_core.runtimes.tensorrt_engine import build_engine, load_engine
 
 _HASH_DIGITS = 16
 
@@ -73,7 +73,6 @@ def cached_engine(
     precision: Precision,
     gpu: Gpu,
     directory: Path,
-    workspace_mib: int = WORKSPACE_MIB,
 ) -> tuple[Any, Path]:
     """Load the engine of a graph from its file, or build it and keep it there.
 
@@ -86,7 +85,6 @@ def cached_engine(
         precision: Precision of the graph.
         gpu: The current CUDA device.
         directory: Directory of engines; made if it is missing.
-        workspace_mib: See :data:`fus3dmaps_core.runtimes.tensorrt_engine.WORKSPACE_MIB`.
 
     Returns:
         The engine, and where it is kept.
@@ -102,7 +100,7 @@ def cached_engine(
             return engine, path
         _log.warning("TensorRT refuses the engine '%s'; it is built anew", path)
     timings = directory / f"timings_trt{slug(version)}_{gpu.slug}.cache"
-    plan = build_engine(tensorrt, graph, timings, workspace_mib)
+    plan = build_engine(tensorrt, graph, timings)
     engine = load_engine(tensorrt, plan)
     if engine is None:
         raise EncoderError(f"graph '{graph}': TensorRT {version} cannot load the engine that it built")

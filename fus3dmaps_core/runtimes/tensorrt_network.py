@@ -15,7 +15,6 @@ from fus3dmaps_core.runtimes.engine_cache import Gpu, cached_engine
 from fus3dmaps_core.runtimes.graph_input import input_shape
 from fus3dmaps_core.runtimes.packages import import_tensorrt
 from fus3dmaps_core.runtimes.static_batches import run_in_batches
-from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB
 
 
 class TensorRTNetwork:
@@ -90,9 +89,7 @@ class TensorRTNetwork:
         return found
 
 
-def engine_of(
-    path: Path, device: str, precision: Precision, directory: Path, workspace_mib: int = WORKSPACE_MIB
-) -> tuple[TensorRTNetwork, Path]:
+def engine_of(path: Path, device: str, precision: Precision, directory: Path) -> tuple[TensorRTNetwork, Path]:
     """Open the engine of an ONNX file as a network; build it first where there is none, which takes minutes.
 
     Args:
@@ -100,7 +97,6 @@ def engine_of(
         device: CUDA device.
         precision: Precision of the graph.
         directory: Where engines are kept; made if it is missing.
-        workspace_mib: See :data:`fus3dmaps_core.runtimes.tensorrt_engine.WORKSPACE_MIB`.
 
     Returns:
         The network, and the file of its engine.
@@ -111,7 +107,7 @@ def engine_of(
     check_cuda(device)
     tensorrt, shape = import_tensorrt(), input_shape(path)
     with torch.cuda.device(torch.device(device)):
-        engine, kept = cached_engine(tensorrt, path, shape, precision, Gpu.of(device), directory, workspace_mib)
+        engine, kept = cached_engine(tensorrt, path, shape, precision, Gpu.of(device), directory)
         return TensorRTNetwork(tensorrt, engine, device, path.name), kept
 
 
