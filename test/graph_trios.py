@@ -29,7 +29,7 @@ CROP_PX = 64
 
 
 def narrow_clip_dinoiser() -> EncoderTrio:
-    """The heads need the full width of 768; there are 3 blocks in place of 12."""
+    """Make a narrow trio: the heads need the full width of 768, but there are 3 blocks in place of 12."""
     from open_clip.model import CLIP
 
     torch.manual_seed(7)
@@ -49,7 +49,7 @@ def narrow_radio(name: str, folder: Path) -> EncoderTrio:
 
 
 def narrow_siglip2(folder: Path) -> EncoderTrio:
-    """An embedding has the full width of 768; there are 3 blocks in place of 12."""
+    """Make a narrow trio: an embedding has the full width of 768, but there are 3 blocks in place of 12."""
     torch.manual_seed(13)
     text = replace(siglip2_published.TEXT, vocabulary=40, width=32, hidden=48, layers=1, heads=2)
     write_directory(folder, random_model(CROP_PX, text))

@@ -26,14 +26,14 @@ WORDS = "a an the of in red blue photo square cup game video"
 
 
 def find_checkout() -> Path:
-    """RADIO's own code where this machine has it, and a stand-in of the same classes otherwise."""
+    """Find RADIO's own code on this machine, or else a stand-in of the same classes."""
     named = os.environ.get("FUS3DMAPS_RADIO_CHECKOUT")
     candidates = [Path(named)] if named else [Path(torch.hub.get_dir()) / f"NVlabs_RADIO_{REVISION}"]
     return next((path for path in candidates if (path / "hubconf.py").is_file()), STAND_IN)
 
 
 def options(name: str, model: str, **model_options) -> argparse.Namespace:
-    """What a checkpoint says about the networks in it, as far as their construction asks for it."""
+    """Describe the networks of a checkpoint, as far as their construction asks for it."""
     return argparse.Namespace(
         model=model,
         model_kwargs=model_options,
@@ -60,7 +60,7 @@ def options(name: str, model: str, **model_options) -> argparse.Namespace:
 
 
 def write_checkpoint(path: Path, checkout: Path, name: str, hidden: int, inner: int, model: str, **model_options) -> Path:
-    """A checkpoint with random weights for the trio of this name."""
+    """Write a checkpoint with random weights for the trio of this name."""
     described = options(name, model, **model_options)
     build = import_from(checkout, "radio.radio_model", name).create_model_from_args
     network = build(argparse.Namespace(**{**vars(described), "model_kwargs": dict(model_options)}))
@@ -96,24 +96,24 @@ def with_norms(path: Path) -> Path:
 
 
 def any_content(file: WeightFile) -> WeightFile:
-    """The file as far as its name and place go: random weights have no published hash."""
+    """Return the file without its hash: random weights have no published one."""
     return replace(file, sha256="", git_blob="")
 
 
 def with_any_content(variant: RadioVariant) -> RadioVariant:
-    """The trio with files that may hold random weights."""
+    """Return the variant with files that may hold random weights."""
     text = replace(variant.text, weights=any_content(variant.text.weights), tokenizer=any_content(variant.text.tokenizer))
     return replace(variant, radio=any_content(variant.radio), text=text)
 
 
 def small_text_variant(name: str) -> RadioVariant:
-    """The trio with a narrow text tower of the same class, and files of any content."""
+    """Return the variant with a narrow text tower of the same class, and files of any content."""
     variant = with_any_content(VARIANTS[name])
     return replace(variant, text=replace(variant.text, vocabulary=100, width=32, hidden=64, layers=2, heads=2))
 
 
 def write_text(folder: Path, variant: RadioVariant, lengths_differ: bool = False) -> torch.nn.Module:
-    """Files of the trio's text tower with random weights, and of a tokenizer with a few words; returns the tower.
+    """Write files of a text tower with random weights, and of a tokenizer with a few words; return the tower.
 
     Args:
         folder: Where to.
@@ -142,7 +142,7 @@ def write_text(folder: Path, variant: RadioVariant, lengths_differ: bool = False
 
 
 def _spread(tower: torch.nn.Module, variant: RadioVariant) -> None:
-    """Other weights: sentences have more influence, and the bias at the end takes away what all of them have in common."""
+    """Draw weights in which sentences have more influence; the bias at the end takes away what they have in common."""
     weights = dict(tower.named_parameters())
     for name, weight in weights.items():
         torch.nn.init.normal_(weight, mean=1.0 if name.endswith("norm.weight") else 0.0)

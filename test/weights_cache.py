@@ -98,7 +98,7 @@ def _write_siglip2(root: Path) -> None:
 
 
 def _place(root: Path, file: WeightFile) -> Path:
-    """Where a published file lies in the cache below a directory; its folder is made."""
+    """Return where a published file lies in the cache below a directory, and make its folder."""
     path = root / "fus3dmaps" / file.cached_path.parent.name / file.cached_path.name
     path.parent.mkdir(parents=True, exist_ok=True)
     return path

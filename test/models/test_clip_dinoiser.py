@@ -49,7 +49,7 @@ def trio(clip, heads) -> EncoderTrio:
 
 @pytest.fixture(scope="module")
 def directory(clip, heads, tmp_path_factory) -> Path:
-    """Weights of one's own, as `encoder.weights` takes them."""
+    """Write weights of one's own, as `encoder.weights` takes them."""
     folder = tmp_path_factory.mktemp("weights")
     save_file(clip.state_dict(), folder / "open_clip_model.safetensors")
     save_file(heads.state_dict(), folder / "last.safetensors")
@@ -61,7 +61,7 @@ def picture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def normalised(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 as the network takes it: (3, H, W)."""
+    """Normalise an (H, W, 3) uint8 image as the network takes it: (3, H, W)."""
     return ((rgb / 255.0 - MEAN) / STD).transpose(2, 0, 1)
 
 
@@ -122,7 +122,7 @@ def test_the_value_path_is_the_plain_ones(network, rng, size):
 
 
 def plain_heads(features: np.ndarray, weights: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Correlations (patches, patches) and saliency (rows, columns) of (width, rows, columns) features."""
+    """Compute correlations (patches, patches) and saliency (rows, columns) of (width, rows, columns) features."""
     _, rows, columns = features.shape
     padded = np.pad(features, ((0, 0), (1, 1), (1, 1)), mode="edge")
     projected = weights["obj_proj.bias"][:, None, None] + sum(

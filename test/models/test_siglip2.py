@@ -79,7 +79,7 @@ def picture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def normalised(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 as the network takes it: (3, H, W)."""
+    """Normalise an (H, W, 3) uint8 image as the network takes it: (3, H, W)."""
     return ((rgb / 255.0 - MEAN) / STD).transpose(2, 0, 1)
 
 

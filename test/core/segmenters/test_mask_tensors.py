@@ -1,4 +1,4 @@
-"""What is shared by segmenters of many overlapping masks, against plain loops and known answers."""
+"""Masks as tensors: which of overlapping ones stay, and their full size, against plain loops and known answers."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def plain_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def plain_weights(pixels: int, cells: int, first: float, last: float) -> np.ndarray:
-    """(pixels, cells): what each cell gives to each pixel's centre, within the cells that the region touches."""
+    """Compute what each cell gives to each pixel's centre, within the cells that the region touches: (pixels, cells)."""
     weights = np.zeros((pixels, cells))
     lowest, highest = int(np.floor(first)), int(np.ceil(last)) - 1
     for pixel in range(pixels):

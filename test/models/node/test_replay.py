@@ -40,7 +40,7 @@ def another_than(name: str) -> str:
 
 @pytest.fixture
 def offline(cached, recording, maps, config) -> Any:
-    """Maps the recording in this process with the trio of a name, once, and saves the map under ``offline_NAME``."""
+    """Map the recording in this process with the trio of a name, once, and save the map under ``offline_NAME``."""
 
     def mapped(name: str) -> Path:
         path = maps / f"offline_{name}"

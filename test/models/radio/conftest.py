@@ -20,7 +20,7 @@ def checkout() -> Path:
 
 @pytest.fixture(scope="session", params=["naradio", "radseg"])
 def loaded(request, checkout, tmp_path_factory) -> SimpleNamespace:
-    """A directory of weights, the trio that it is for, its three encoders, and what the files hold."""
+    """Write a directory of weights; return it, the variant that it is for, its three encoders, and what the files hold."""
     torch.manual_seed(11)
     folder = tmp_path_factory.mktemp(request.param)
     variant = small_text_variant(request.param)

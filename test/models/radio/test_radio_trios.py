@@ -36,13 +36,13 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 def in_file(loaded, prefix: str) -> dict[str, np.ndarray]:
-    """Weights of the checkpoint whose names begin so, under the rest of their names."""
+    """Return the weights of the checkpoint whose names begin so, under the rest of their names."""
     state = torch.load(loaded.checkpoint, weights_only=False)["state_dict"]
     return {name.removeprefix(prefix): value.double().numpy() for name, value in state.items() if name.startswith(prefix)}
 
 
 def head(loaded, features: np.ndarray) -> np.ndarray:
-    """The teacher's head by its weights in the file alone: unit embeddings of (..., width) features."""
+    """Apply the teacher's head by its weights in the file alone: unit embeddings of (..., width) features."""
     weights = in_file(loaded, f"_heads.{TEACHER}.")
 
     def layer(values, name):
@@ -58,7 +58,7 @@ def head(loaded, features: np.ndarray) -> np.ndarray:
 
 
 def into_the_last_block(loaded, rgb: np.ndarray) -> np.ndarray:
-    """Tokens (N, width) that RADIO's own pass over an image brings to its last block."""
+    """Return the tokens (N, width) that RADIO's own pass over an image brings to its last block."""
     seen: list[torch.Tensor] = []
     hook = loaded.radio.model.blocks[-1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
     try:

@@ -19,7 +19,7 @@ SHAPE = (3, 3, 4, 6)
 
 
 def write(path: Path, shape=SHAPE, kind=TensorProto.FLOAT, inputs=1, result=TensorProto.FLOAT) -> Path:
-    """Twice the images, and their means by channel."""
+    """Write a graph that gives twice the images, and their means by channel."""
     given = [helper.make_tensor_value_info(f"images{place}", kind, shape) for place in range(inputs)]
     outputs = [helper.make_tensor_value_info(name, result, None) for name in ("double", "means")]
     nodes = [

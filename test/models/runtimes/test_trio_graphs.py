@@ -24,7 +24,7 @@ GRAPHS = [(name, kind) for name in TRIOS for kind in KINDS]
 
 @pytest.fixture(scope="session")
 def exported(trios, tmp_path_factory):
-    """Exports a graph once."""
+    """Export a graph once."""
     folder: Path = tmp_path_factory.mktemp("graphs")
 
     @cache
@@ -36,7 +36,7 @@ def exported(trios, tmp_path_factory):
 
 
 def errors(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """1 - cos along the last axis."""
+    """Compute 1 - cos along the last axis."""
     expected, found = expected.astype(np.float64), found.astype(np.float64)
     lengths = np.linalg.norm(expected, axis=-1) * np.linalg.norm(found, axis=-1)
     return 1 - (expected * found).sum(axis=-1) / lengths

@@ -18,7 +18,7 @@ def classifier() -> EfficientNetLite0:
 
 
 def plain_features(state: dict[str, torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """The same network written as a list of operations on the raw weights, normalisation apart."""
+    """Run the same network written as a list of operations on the raw weights, normalisation apart."""
 
     def conv(name: str, x: torch.Tensor, stride: int = 1, groups: int = 1) -> torch.Tensor:
         weight = state[f"{name}.weight"]
