@@ -22,9 +22,6 @@ def check_device(device: str) -> None:
 
 
 def default_dtype(device: str) -> torch.dtype:
-    """Choose the precision of a transformer.
-
-    Returns:
-        bfloat16 on CUDA, in which SigLIP 2 was trained and RADIO's authors run it; float32 elsewhere, where it is faster.
-    """
+    """Choose a transformer's precision: bfloat16 on CUDA, and float32 elsewhere, where it is the faster one."""
+    # SigLIP 2 was trained in bfloat16, and RADIO's authors run it so.
     return torch.bfloat16 if torch.device(device).type == "cuda" else torch.float32

@@ -11,15 +11,15 @@ from fus3dmaps_core.encoders.cards import CodeCheckout, EncoderCard
 from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.devices import check_device, default_dtype
 from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
+from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.encoders.radio.adaptor import CropNetwork, PatchNetwork, SummaryHead, load_head
 from fus3dmaps_core.encoders.radio.backbone import DenseAttention, RadioBackbone
 from fus3dmaps_core.encoders.radio.checkout import ARCHIVE, cached_checkout, find_checkout, import_from, locate_checkout
 from fus3dmaps_core.encoders.radio.checkpoint import read_checkpoint
 from fus3dmaps_core.encoders.radio.published import CODE_LICENCE
-from fus3dmaps_core.encoders.radio.text import load_text
-from fus3dmaps_core.encoders.siglip_text import TextTower
-from fus3dmaps_core.encoders.weights import WeightFile, find_weights, saying_what_to_get
+from fus3dmaps_core.encoders.siglip_text import TextTower, read_text
+from fus3dmaps_core.encoders.weights import WeightFile, find_weights, only_directory, saying_what_to_get
 from fus3dmaps_core.errors import EncoderError
 
 _PATCH_PX = 16  # Of all published RADIO models of these versions.
@@ -90,19 +90,24 @@ def load_trio(variant: RadioVariant, device: str, crop_padding: float, weights: 
     """
     check_device(device)
     backbone, head = load_networks(variant, weights)
-    dtype = default_dtype(device)
-    text = load_text(variant.text, weights, device, variant.name)
-    return make_trio(variant, backbone, head, text, device, crop_padding, dtype)
+    text = load_text_encoder(variant, device, weights)
+    return make_trio(variant, backbone, head, text, device, crop_padding, default_dtype(device))
 
 
 def load_text_encoder(variant: RadioVariant, device: str, weights: str) -> TextEncoder:
-    """Load the text encoder of a trio alone; nothing of RADIO is needed.
+    """Load the text encoder of a trio alone: the text tower of its teacher. Nothing of RADIO is needed.
 
     Raises:
         EncoderError: As :func:`load_trio`.
     """
     check_device(device)
-    return load_text(variant.text, weights, device, variant.name)
+    for package in ("open_clip", "transformers"):
+        import_optional(package, variant.name)
+    directory, tower = only_directory(weights), variant.text  # A file or a repository of the hub is RADIO's.
+    tokenizer = find_weights("encoder.weights", directory, tower.tokenizer)
+    model = find_weights("encoder.weights", directory, tower.weights)
+    with saying_what_to_get("encoder.weights", tower.weights):
+        return read_text(tower, model, tokenizer, device, variant.name)
 
 
 def load_networks(variant: RadioVariant, weights: str) -> tuple[RadioBackbone, SummaryHead]:
