@@ -46,6 +46,6 @@ class StorageError(Fus3dmapsError):
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an exception says, for a message of one line, and its class where it says nothing."""
+    """Return the first line of what an exception says, for a message of one line, and its class where it says nothing."""
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[0] if lines else type(error).__name__

@@ -44,7 +44,7 @@ class Intrinsics:
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float64)
 
     def resized(self, width: int, height: int) -> Intrinsics:
-        """The same camera after its image is resized to ``width`` x ``height`` pixels."""
+        """Return the camera model of the image resized to ``width`` x ``height`` pixels."""
         sx, sy = width / self.width, height / self.height
         # Pixel centres are integers, so it is x + 0.5 that scales.
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height)

@@ -22,7 +22,7 @@ class Masks:
 
     @classmethod
     def from_masks(cls, masks: NDArray[np.bool_]) -> Masks:
-        """Masks with their tight boxes; every mask must hold at least one pixel."""
+        """Bound masks by their tight boxes; every mask must hold at least one pixel."""
         n = len(masks)
         boxes = np.zeros((n, 4), np.int32)
         for row, mask in enumerate(masks):
@@ -31,9 +31,9 @@ class Masks:
         return cls(masks, boxes)
 
     def __len__(self) -> int:
-        """Number of masks."""
+        """Return the number of masks."""
         return len(self.masks)
 
     def take(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Masks:
-        """The masks of the given rows, in that order."""
+        """Return the masks of the given rows, in that order."""
         return Masks(self.masks[rows], self.boxes[rows])

@@ -19,7 +19,7 @@ from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
 from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.encoders.text_cache import CachedTextEncoder
 from fus3dmaps_core.frame import PosedFrame
-from fus3dmaps_core.geometry.motion import KeyframeGate
+from fus3dmaps_core.geometry.keyframe_gate import KeyframeGate
 from fus3dmaps_core.geometry.projection import WorkingFrame, resize_frame, sample_pixels, unproject
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.runtimes.acceleration import accelerate

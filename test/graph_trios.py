@@ -1,4 +1,4 @@
-"""Every pair with random weights, narrow and for small crops, and a toy one for what does not depend on the network."""
+"""Every trio with random weights, narrow and for small crops, and a toy one for what does not depend on the network."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from radio_files import find_checkout, small_text_pair, with_norms, write_checkpoint, write_text
+from radio_files import find_checkout, small_text_variant, with_norms, write_checkpoint, write_text
 from siglip2_files import random_model, write_directory
 from torch import nn
 from torch.nn import functional
@@ -15,21 +15,21 @@ from torch.nn import functional
 from fus3dmaps_core.encoders import siglip2
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
-from fus3dmaps_core.encoders.graphs import Graph, Network
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio, PatchEmbeddings
-from fus3dmaps_core.encoders.radio import pair as radio_pair
+from fus3dmaps_core.encoders.radio import loading
 from fus3dmaps_core.encoders.siglip2 import published as siglip2_published
 from fus3dmaps_core.encoders.siglip2.network import read_vision
 from fus3dmaps_core.encoders.siglip_text import read_text
 from fus3dmaps_core.masks import Masks
 
-PAIRS = ("lite", "clip_dinoiser", "naradio", "radseg", "siglip2")
+TRIOS = ("lite", "clip_dinoiser", "naradio", "radseg", "siglip2")
 HEIGHT, WIDTH = 100, 150  # No multiples of a patch.
 CROP_PX = 64
 
 
 def narrow_clip_dinoiser() -> EncoderTrio:
-    """The heads need the full width of 768; there are 3 blocks in place of 12."""
+    """Make a narrow trio: the heads need the full width of 768, but there are 3 blocks in place of 12."""
     from open_clip.model import CLIP
 
     torch.manual_seed(7)
@@ -41,15 +41,15 @@ def narrow_clip_dinoiser() -> EncoderTrio:
 
 def narrow_radio(name: str, folder: Path) -> EncoderTrio:
     torch.manual_seed(11)
-    checkout, pair = find_checkout(), replace(small_text_pair(name), crop_px=CROP_PX)
+    checkout, variant = find_checkout(), replace(small_text_variant(name), crop_px=CROP_PX)
     (folder / "RADIO").symlink_to(checkout, target_is_directory=True)
-    with_norms(write_checkpoint(folder / pair.radio.file_name, checkout, name, 48, 2, "vit_tiny_patch16_224", depth=3))
-    write_text(folder, pair)
-    return radio_pair.load_trio(pair, "cpu", 0.05, str(folder))
+    with_norms(write_checkpoint(folder / variant.radio.file_name, checkout, name, 48, 2, "vit_tiny_patch16_224", depth=3))
+    write_text(folder, variant)
+    return loading.load_trio(variant, "cpu", 0.05, str(folder))
 
 
 def narrow_siglip2(folder: Path) -> EncoderTrio:
-    """An embedding has the full width of 768; there are 3 blocks in place of 12."""
+    """Make a narrow trio: an embedding has the full width of 768, but there are 3 blocks in place of 12."""
     torch.manual_seed(13)
     text = replace(siglip2_published.TEXT, vocabulary=40, width=32, hidden=48, layers=1, heads=2)
     write_directory(folder, random_model(CROP_PX, text))

@@ -13,7 +13,7 @@ WORDS = "a an the of in red blue photo square cup game video itap bad origami la
 
 
 def random_model(size_px: int, text: TextTower) -> torch.nn.Module:
-    """The package's own model of both towers, the image tower at full width, the text tower as described."""
+    """Make the package's own model of both towers, the image tower at full width, the text tower as described."""
     from transformers import SiglipConfig, SiglipModel, SiglipTextConfig
 
     described = SiglipTextConfig(
@@ -36,7 +36,7 @@ def random_model(size_px: int, text: TextTower) -> torch.nn.Module:
 
 
 def published_state(model: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """Its weights under the names of the published file, which have no shells around the towers."""
+    """Return its weights under the names of the published file, which have no shells around the towers."""
     return {
         name.replace("text_model.text_model.", "text_model.").replace(
             "vision_model.vision_model.", "vision_model."
@@ -46,14 +46,14 @@ def published_state(model: torch.nn.Module) -> dict[str, torch.Tensor]:
 
 
 def write_directory(folder: Path, model: torch.nn.Module) -> Path:
-    """What `encoder.weights` takes for weights of one's own; under the published file's name they would need its hash."""
+    """Write weights of one's own for `encoder.weights`; under the published file's name they would need its hash."""
     torch.save(published_state(model), folder / "model.pt")
     write_tokenizer(folder / "tokenizer.json")
     return folder
 
 
 def write_tokenizer(path: Path) -> Path:
-    """A tokenizer of whole words whose first three are padding, end and the unknown word."""
+    """Write a tokenizer of whole words whose first three are padding, end and the unknown word."""
     words = {word: place for place, word in enumerate(["<pad>", "<eos>", "<unk>", *WORDS.split()])}
     tokenizer = Tokenizer(models.WordLevel(words, unk_token="<unk>"))
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()

@@ -27,7 +27,7 @@ class ILogger:
 
 
 def array_at(address: int, shape: tuple[int, ...]) -> np.ndarray:
-    """The float32 memory at an address."""
+    """Return the float32 memory at an address."""
     count = int(np.prod(shape))
     return np.ctypeslib.as_array(ctypes.cast(address, ctypes.POINTER(ctypes.c_float)), (count,)).reshape(shape)
 

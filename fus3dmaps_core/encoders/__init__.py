@@ -1,1 +1,1 @@
-"""Vision-language encoders: Protocols, a registry and one module or folder per pair."""
+"""Vision-language encoders: Protocols, a registry and one module or folder per trio."""

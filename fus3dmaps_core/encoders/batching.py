@@ -1,4 +1,4 @@
-"""Encoders that run out of GPU memory: a batch is halved and goes on, and what cannot be helped is refused by name."""
+"""Encoders that run out of GPU memory: their batches are halved, and only a single image that does not fit is an error."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from fus3dmaps_core.errors import EncoderError
 _log = logging.getLogger(__name__)
 
 RETRY_AFTER = 100
-"""Batches of the largest size that fit before twice the size is tried again."""
+"""How many batches of the largest size must fit before twice the size is tried again."""
 
 
 class Batches:
-    """Runs an encoder over many images, in batches that fit its device's memory.
+    """The batches in which an encoder embeds many images, as large as its device's memory allows.
 
     A batch that does not fit is halved, and later ones keep to that size. After ``RETRY_AFTER`` of them twice the size is
-    tried, for who took the memory may have given it back; a try that fails costs no image, and as many must fit before the
-    next one. The limit goes once a batch of the size fits that was too large at first.
+    tried, since the memory may be free again. A try that fails loses no image, and as many batches must fit before the next
+    one. The limit is lifted once a batch fits that is as large as the first one that did not.
 
     Attributes:
         largest: Images that are encoded together at most; None while no limit is known.
@@ -77,7 +77,7 @@ class Batches:
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
     def _size(self) -> int:
-        """Images that the next batch may have."""
+        """Return how many images the next batch may have."""
         if self.largest is None:
             return sys.maxsize
         return 2 * self.largest if self._fitted >= RETRY_AFTER else self.largest
@@ -87,7 +87,7 @@ class Batches:
         if self.largest is None:
             self._too_large = size
         elif size > self.largest:
-            return  # A try: what fitted before it does still.
+            return  # A try; what fitted before still does.
         self.largest = size // 2
 
     def _fits(self, size: int) -> None:
@@ -101,10 +101,10 @@ class Batches:
 
 @contextmanager
 def naming_out_of_memory(name: str) -> Iterator[None]:
-    """Turn a device's want of memory inside into an EncoderError that names the encoder or segmenter.
+    """Turn a device's lack of memory inside into an EncoderError that names the encoder or segmenter.
 
     Raises:
-        EncoderError: The device was out of memory; what is cached of it was given back.
+        EncoderError: The device was out of memory; its cached memory was given back.
     """
     cause: str | None = None
     try:

@@ -47,7 +47,7 @@ class CodeCheckout:
 
 @dataclass(frozen=True)
 class EncoderCard:
-    """One trio.
+    """What there is to know about one trio.
 
     Attributes:
         name: Registry name.
@@ -81,6 +81,6 @@ class EncoderCard:
     extra: str = "models"
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the patch grid that covers an image of this size, pixels."""
+        """Return rows and columns of the patch grid that covers an image of this size, pixels."""
         edge = self.patch_px * self.grid_multiple
         return self.grid_multiple * -(-height // edge), self.grid_multiple * -(-width // edge)

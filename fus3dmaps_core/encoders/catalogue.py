@@ -1,4 +1,4 @@
-"""Every encoder trio with what of it is installed on this machine. Nothing is loaded, and the network is never touched."""
+"""Every encoder trio, and which of its parts are on this machine. Nothing is loaded, and the network is never touched."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Part:
 
     Attributes:
         title: What it is.
-        licence: Its licence; of code "", which the card has.
+        licence: Its licence; "" for code, whose licence the card has.
         source: The address to download it from, or the command that installs it.
         path: Where it is on this machine; None where it is not.
         put_at: Where to put it by hand; None where a package brings it.
@@ -70,7 +70,7 @@ class Entry:
 
     @property
     def installed(self) -> bool:
-        """Whether all that it needs is here, by its looks: hashes are compared when it is loaded."""
+        """Whether all that it needs seems to be here; hashes are only compared when it is loaded."""
         return not self.missing
 
     @property
@@ -89,8 +89,8 @@ def catalogue(weights: str = "", encoder: str = "") -> list[Entry]:
     """Look at every trio of the registry, by name.
 
     Args:
-        weights: ``encoder.weights``. A directory is looked into for every trio's files; a file or a repository of the hub is
-            the trio's that ``encoder`` names, and the others' files are looked for where they are published.
+        weights: ``encoder.weights``. In a directory all trios' files are looked for. A file or a repository of the hub
+            belongs to the trio that ``encoder`` names; those of the others are looked for where they are published.
         encoder: ``encoder.name``.
 
     Raises:
@@ -125,7 +125,7 @@ def _entry(name: str, card: EncoderCard, weights: str) -> Entry:
 
 
 def package_problem(module: str) -> str:
-    """Why a module of another package cannot be imported, as far as can be told without importing it; "" if it may be.
+    """Say why a module of another package cannot be imported, judged without importing it; "" if it probably can.
 
     A package that is built for one release of torch, as torchvision is, says so in its installation record.
     """

@@ -1,4 +1,4 @@
-"""Crops of a frame as one tensor: padded, resized in their shape, copied to the device at once and normalised there."""
+"""Crops of a frame as one tensor: padded, resized with their aspect, copied to the device at once and normalised there."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 
 class CropBatcher:
-    """Cuts the boxes of an image out as square inputs of a network.
+    """A cutter of boxes from an image into square inputs of a network.
 
-    A crop keeps its aspect and loses none of its ends: its longer side becomes the network's, it is centred on the shorter
-    one, and what is left over has the mean colour, which the network reads as zero. Pixels around the object inside its box
-    stay: the networks were trained on whole pictures [sec: Instance-level mapping].
+    A crop keeps its aspect and is not cut: its longer side is scaled to the network's, it is centred along the shorter one,
+    and the rest has the mean colour, which the network reads as zero. Pixels around the object inside its box stay: the
+    networks were trained on whole pictures [sec: Instance-level mapping].
     """
 
     def __init__(self, size_px: int, mean: Sequence[float], std: Sequence[float], padding: float, device: str) -> None:
@@ -24,7 +24,7 @@ class CropBatcher:
         Args:
             size_px: Edge of its square input, pixels.
             mean: Mean of red, green and blue in [0, 1], which is subtracted.
-            std: Deviation of the three, by which is divided.
+            std: Standard deviation of the three, which is divided by.
             padding: Added on every side of a box, as a share of its width or height; it ends at the image's border.
             device: Torch device of the network.
         """

@@ -1,9 +1,9 @@
 """Embeddings of masks from the patch embeddings of their image, without a second encoder.
 
 A crop costs a pass of a network, and shows the object without its surroundings at another scale than the network's patches.
-The patches of the same frame have been embedded already, in context; what a mask is about is their mean under the mask, in
+The patches of the same frame have been embedded already, in context; a mask is embedded as their mean under the mask, in
 which a pixel counts by its distance to the mask's edge: patches across an edge mix two things, and segmenters err there.
-The idea is that of Igelbrink et al. 2026, "DISC"; pooling here is over a pair's dense embeddings, whichever pair it is.
+The idea is that of Igelbrink et al. 2026, "DISC"; pooling here is over the patch embeddings of any trio.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ def pool_masks(patches: PatchEmbeddings, masks: Masks) -> NDArray[np.float32]:
 
 
 def patch_shares(masks: Masks, rows: int, columns: int) -> NDArray[np.float32]:
-    """What each patch has of each mask: the sum, over the mask's pixels in it, of their distance to the mask's edge.
+    """Compute each patch's share of each mask: the mask's pixels in it, summed by their distance to the mask's edge.
 
     An object that the image cuts off goes on beyond it: the image's border is no edge. Patch (r, c) of an image of height H
-    begins at row r H / rows, where a pixel belongs to the patch that its centre lies in.
+    begins at row r H / rows; a pixel belongs to the patch in which its centre lies.
 
     Args:
         masks: n masks of one image.
-        rows: Of the patch grid.
-        columns: Of the patch grid.
+        rows: Rows of the patch grid.
+        columns: Columns of the patch grid.
 
     Returns:
         (n, rows, columns) float32, pixels.

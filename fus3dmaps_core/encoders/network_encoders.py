@@ -1,6 +1,6 @@
 """Patch and crop encoders around one torch network each, which takes normalised images and gives unit embeddings.
 
-The pairs differ in their networks; how frames and crops are brought to them, and what else may run in their place, is here.
+The trios differ in their networks. How frames and crops are prepared, and how another runtime takes over, is the same.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from fus3dmaps_core.encoders.crop_batches import CropBatcher
-from fus3dmaps_core.encoders.graphs import Graph, Network
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import PatchEmbeddings
 from fus3dmaps_core.masks import Masks
 
@@ -22,7 +22,7 @@ _BATCH = 16  # Bounds the memory of a pass; a frame has up to 64 crops.
 
 
 class NetworkPatchEncoder:
-    """Embeds the patches of a frame in one pass.
+    """A patch encoder that embeds a frame in one pass of a network.
 
     Attributes:
         network: From (1, 3, H, W) normalised images to (1, rows, columns, d) embeddings and, where it has them, (1, rows,
@@ -43,10 +43,10 @@ class NetworkPatchEncoder:
         Args:
             network: On the device, in evaluation mode; it brings images to the precision of its weights.
             patch_px: Edge of a patch, pixels.
-            mean: Of red, green and blue in [0, 1], which is subtracted.
-            std: Deviation of the three, by which is divided.
+            mean: Mean of red, green and blue in [0, 1], which is subtracted.
+            std: Standard deviation of the three, which is divided by.
             device: Torch device.
-            outputs: Names of what the network gives; the weights of patches are the second of it, or 1.
+            outputs: Names of the network's outputs; a second one has the weights of the patches, which are 1 otherwise.
         """
         self.network, self._patch_px, self._outputs = network, patch_px, outputs
         self._run: Network = network
@@ -56,7 +56,7 @@ class NetworkPatchEncoder:
         self._std = 255.0 * torch.tensor(std, device=self._device).reshape(1, 3, 1, 1)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the patch grid: one per patch, rounded up."""
+        """Return rows and columns of the patch grid, rounded up."""
         return -(-height // self._patch_px), -(-width // self._patch_px)
 
     def encode_patches(self, rgb: NDArray[np.uint8]) -> PatchEmbeddings:
@@ -76,11 +76,11 @@ class NetworkPatchEncoder:
             return PatchEmbeddings(embeddings[0].cpu().numpy(), weights)
 
     def graph(self, height: int, width: int) -> Graph:
-        """The network at the size that an image of this one is stretched to."""
+        """Describe the network at the size that such an image is stretched to."""
         return Graph("patch", self.network, (1, 3, *self._stretched(height, width)), self._outputs)
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network
 
     def _stretched(self, height: int, width: int) -> tuple[int, int]:
@@ -89,7 +89,7 @@ class NetworkPatchEncoder:
 
 
 class NetworkCropEncoder:
-    """Embeds the boxes around masks, in batches.
+    """A crop encoder that embeds the boxes around masks, in batches.
 
     Attributes:
         network: From (n, 3, side, side) normalised images to (n, d) embeddings of unit length.
@@ -111,9 +111,9 @@ class NetworkCropEncoder:
             network: On the device, in evaluation mode; it brings images to the precision of its weights.
             dimension: Embedding width d.
             size_px: Edge of its input, pixels.
-            mean: Of red, green and blue in [0, 1], which is subtracted.
-            std: Deviation of the three, by which is divided.
-            padding: Around a mask's box, as a share of its size.
+            mean: Mean of red, green and blue in [0, 1], which is subtracted.
+            std: Standard deviation of the three, which is divided by.
+            padding: Padding around a mask's box, as a share of its size.
             device: Torch device.
         """
         self.network, self._dimension, self._size_px = network, dimension, size_px
@@ -131,9 +131,9 @@ class NetworkCropEncoder:
         return embeddings
 
     def graph(self, height: int, width: int) -> Graph:
-        """The network for a batch of crops, whose size is that of no image."""
+        """Describe the network for a batch of crops, whose size does not depend on the image's."""
         return Graph("crop", self.network, (_BATCH, 3, self._size_px, self._size_px), ("embeddings",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network

@@ -1,4 +1,4 @@
-"""Packages of the extra ``models``, imported only by who loads an encoder that needs them."""
+"""Packages of the extra ``models``, imported only when an encoder or segmenter that needs them is loaded."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ def import_optional(module: str, name: str, kind: str = "encoder") -> ModuleType
 
     Args:
         module: Dotted name.
-        name: Who needs it, for the message.
-        kind: What that is, an encoder or a segmenter.
+        name: Name of the encoder or segmenter that needs it, for the message.
+        kind: ``encoder`` or ``segmenter``.
 
     Raises:
         EncoderError: It is not installed, or not for this torch; the message names the parameter that chose it, and

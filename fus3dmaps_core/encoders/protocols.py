@@ -1,4 +1,4 @@
-"""What the pipeline asks of an encoder trio. Encoders know images and text, never the map.
+"""What the pipeline needs from an encoder trio. Encoders know images and text, never the map.
 
 All three encoders of a trio write into one d-dimensional vision-language space [sec: Vision Models]: the cosine of any two
 of their outputs is a similarity.
@@ -30,10 +30,10 @@ class PatchEmbeddings:
 
 
 class PatchEncoder(Protocol):
-    """Embeds every patch of an image in one pass."""
+    """An encoder of every patch of an image, in one pass."""
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the patch grid for an image of this size, without running the model."""
+        """Return rows and columns of the patch grid for an image of this size, without running the model."""
         ...
 
     def encode_patches(self, rgb: NDArray[np.uint8]) -> PatchEmbeddings:
@@ -42,7 +42,7 @@ class PatchEncoder(Protocol):
 
 
 class CropEncoder(Protocol):
-    """Embeds the masked objects of an image."""
+    """An encoder of the masked objects of an image."""
 
     def encode_crops(self, rgb: NDArray[np.uint8], masks: Masks) -> NDArray[np.float32]:
         """Embed one crop per mask.
@@ -58,7 +58,7 @@ class CropEncoder(Protocol):
 
 
 class TextEncoder(Protocol):
-    """Embeds prompts."""
+    """An encoder of prompts."""
 
     @property
     def space(self) -> str:

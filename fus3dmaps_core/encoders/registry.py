@@ -1,17 +1,16 @@
-"""Encoder trios by name. A new one is a new file or folder and a line here."""
+"""Encoder trios by name. A new one is a new file or folder with an ``ENCODER``, and a line here."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from importlib import import_module
-from types import ModuleType
 from typing import cast
 
 from fus3dmaps_core.encoders.cards import EncoderCard
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
-_TRIOS = {
+_MODULES = {
     "clip_dinoiser": "fus3dmaps_core.encoders.clip_dinoiser",
     "lite": "fus3dmaps_core.encoders.lite",
     "naradio": "fus3dmaps_core.encoders.radio.naradio",
@@ -21,21 +20,32 @@ _TRIOS = {
 
 
 def names() -> list[str]:
-    """Names of the known encoder trios."""
-    return sorted(_TRIOS)
+    """List the names of the known encoder trios."""
+    return sorted(_MODULES)
 
 
-def card(name: str) -> EncoderCard:
-    """What there is to know about a trio without loading it.
+def definition(name: str) -> EncoderDefinition:
+    """Import the module of a trio and return its definition; nothing is loaded yet.
 
     Raises:
         EncoderError: The name is unknown.
     """
-    return cast(EncoderCard, _module(name).CARD)
+    if name not in _MODULES:
+        raise EncoderError(f"parameter 'encoder.name': unknown encoder '{name}', known are {', '.join(names())}")
+    return cast(EncoderDefinition, import_module(_MODULES[name]).ENCODER)
+
+
+def card(name: str) -> EncoderCard:
+    """Return what there is to know about a trio without loading it.
+
+    Raises:
+        EncoderError: The name is unknown.
+    """
+    return definition(name).card
 
 
 def load_trio(name: str, device: str, crop_padding: float, weights: str = "") -> EncoderTrio:
-    """Load the three encoders of a trio; its module's ``load_trio(device, crop_padding, weights)`` builds them.
+    """Load the three encoders of a trio.
 
     Args:
         name: Registry name.
@@ -46,8 +56,7 @@ def load_trio(name: str, device: str, crop_padding: float, weights: str = "") ->
     Raises:
         EncoderError: The name is unknown, or its packages or weights are missing or altered.
     """
-    load = cast(Callable[[str, float, str], EncoderTrio], _module(name).load_trio)
-    return load(device, crop_padding, weights)
+    return definition(name).load_trio(device, crop_padding, weights)
 
 
 def load_text_encoder(name: str, device: str, weights: str = "") -> TextEncoder:
@@ -56,11 +65,4 @@ def load_text_encoder(name: str, device: str, weights: str = "") -> TextEncoder:
     Raises:
         EncoderError: As :func:`load_trio`.
     """
-    load = cast(Callable[[str, str], TextEncoder], _module(name).load_text_encoder)
-    return load(device, weights)
-
-
-def _module(name: str) -> ModuleType:
-    if name not in _TRIOS:
-        raise EncoderError(f"parameter 'encoder.name': unknown encoder '{name}', known are {', '.join(names())}")
-    return import_module(_TRIOS[name])
+    return definition(name).load_text_encoder(device, weights)

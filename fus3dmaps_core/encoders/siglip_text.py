@@ -1,6 +1,6 @@
 """SigLIP's text towers: ``transformers`` builds them, one file holds their weights, another the words that they know.
 
-The encoders of several pairs live in such a tower's space; each says which one, and with which templates it is asked.
+Several trios embed into the space of such a tower; each says which tower it is and which templates it uses.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class TextTower:
         width: Length of a token inside.
         hidden: Width inside the MLPs.
         layers: How many blocks.
-        heads: Of attention.
+        heads: Number of attention heads.
         context: Tokens of a sentence.
         templates: Name of the list of sentences in ``open_clip.zero_shot_metadata`` that a prompt is put into.
     """
@@ -66,12 +66,12 @@ class TextTower:
 
 
 class SiglipTextEncoder:
-    """Embeds prompts in templates that were made for ImageNet's class names.
+    """A text encoder that puts prompts into templates made for ImageNet's class names.
 
     The unit embeddings of a prompt's sentences are averaged, and the mean is brought to unit length.
 
     Attributes:
-        space: Name of the pair.
+        space: Name of the trio.
     """
 
     def __init__(self, tower: Any, tokenizer: Any, published: TextTower, device: str, encoder: str) -> None:
@@ -82,7 +82,7 @@ class SiglipTextEncoder:
             tokenizer: ``tokenizers.Tokenizer``.
             published: What the two are.
             device: Torch device.
-            encoder: Name of the pair.
+            encoder: Name of the trio.
 
         Raises:
             EncoderError: The package ``open_clip``, which has the templates, is missing.
@@ -110,7 +110,7 @@ class SiglipTextEncoder:
         return rows
 
     def _embed(self, sentences: list[str]) -> NDArray[np.float32]:
-        """Unit mean of the unit embeddings of some sentences: (d,)."""
+        """Average the unit embeddings of some sentences and normalise the mean: (d,)."""
         with torch.inference_mode():
             # All of the context is attended to, what fills it too: so the tower was trained.
             embeddings = self._tower(input_ids=self._tokens(sentences), position_ids=self._places).pooler_output
@@ -119,7 +119,7 @@ class SiglipTextEncoder:
         return mean
 
     def _tokens(self, sentences: list[str]) -> torch.Tensor:
-        """(n, context) tokens; a sentence that is too long is cut, not its end."""
+        """Tokenize sentences: (n, context). A sentence that is too long is cut before its end token."""
         context, rows = self._published.context, []
         for encoding in self._tokenizer.encode_batch(sentences, add_special_tokens=False):
             row = [*encoding.ids[: context - 1], self._published.end_id]
@@ -128,7 +128,7 @@ class SiglipTextEncoder:
 
 
 def canonical(text: str) -> str:
-    """A text as SigLIP's authors give it to the tower in zero-shot tests: lower case, no punctuation, single spaces.
+    """Write a text as SigLIP's authors do in zero-shot tests: lower case, no punctuation, single spaces.
 
     SigLIP 2's own tokenizer brings texts to lower case, which is done already then, and leaves the rest as it is.
     """
@@ -138,20 +138,20 @@ def canonical(text: str) -> str:
 def read_text(
     published: TextTower, model: Path, tokenizer: Path, device: str, encoder: str, dtype: torch.dtype = torch.float32
 ) -> SiglipTextEncoder:
-    """A text tower with the weights of a file.
+    """Load a text tower with the weights of a file.
 
     Args:
-        published: Which one.
+        published: What is known of it.
         model: File of the whole model.
         tokenizer: JSON file of the package ``tokenizers``.
         device: Torch device.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
         dtype: Precision of the tower; embeddings are averaged and handed out in float32.
 
     Raises:
         EncoderError: A package is missing, or a file is damaged or another model's.
 
-    A warning is logged where the device is the CPU and the tower so large that whoever asks will wait for an answer.
+    Logs a warning where the device is the CPU and the tower so large that answers take long.
     """
     tower = build_tower(published, encoder).to_empty(device="cpu")
     words = _read_tokenizer(tokenizer, encoder)
@@ -170,7 +170,7 @@ def read_text(
 
 
 def build_tower(published: TextTower, encoder: str) -> Any:
-    """A text tower without memory for its weights: on torch's device ``meta``.
+    """Build a text tower without memory for its weights, on torch's device ``meta``.
 
     Raises:
         EncoderError: The package ``transformers`` is missing.
@@ -193,12 +193,14 @@ def build_tower(published: TextTower, encoder: str) -> Any:
 
 
 def read_part(path: Path, prefix: str, encoder: str) -> dict[str, torch.Tensor]:
-    """The weights of one tower alone, in float32 and without their prefix; a safetensors file is not read beyond them.
+    """Read the weights of one tower alone, in float32 and without their prefix.
+
+    Of a safetensors file nothing else is read.
 
     Args:
         path: File of the whole model.
         prefix: Before the names of these weights.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The package ``safetensors`` is missing, or the file is no weight file.
@@ -212,7 +214,7 @@ def read_part(path: Path, prefix: str, encoder: str) -> dict[str, torch.Tensor]:
 
 
 def weight_names(path: Path, encoder: str) -> list[str]:
-    """Names of all weights in a file.
+    """List the names of all weights in a file.
 
     Raises:
         EncoderError: As :func:`read_part`.

@@ -1,4 +1,4 @@
-"""Embeddings of prompts that were asked before: large text towers take seconds for one on a CPU, and users ask again."""
+"""A cache of prompts' embeddings: large text towers take seconds for one prompt on a CPU, and users ask again."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ _LONGEST = 1000  # Characters of a prompt that is kept.
 
 
 class CachedTextEncoder:
-    """Embeds prompts with another encoder, each once. Safe to use from several threads if that one is.
+    """A text encoder that asks another one once for each prompt. Safe to use from several threads if that one is.
 
     Attributes:
-        space: Name of the other's trio.
+        space: Name of that encoder's trio.
     """
 
     def __init__(self, encoder: TextEncoder, capacity: int = _CAPACITY) -> None:
         """Keep the encoder.
 
         Args:
-            encoder: What embeds.
+            encoder: The encoder to ask.
             capacity: Prompts that are kept; the one that was not asked for the longest time goes first.
         """
         self._encoder, self._capacity, self.space = encoder, capacity, encoder.space
@@ -34,7 +34,7 @@ class CachedTextEncoder:
         self._lock = threading.Lock()
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
-        """Embed n prompts: (n, d) float32, unit length; those that are not known in one call of the encoder."""
+        """Embed n prompts: (n, d) float32, unit length; all unknown ones in one call of the encoder."""
         with self._lock:
             rows = {prompt: self._known[prompt] for prompt in prompts if prompt in self._known}
         unknown = [prompt for prompt in dict.fromkeys(prompts) if prompt not in rows]

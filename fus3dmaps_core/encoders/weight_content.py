@@ -1,4 +1,4 @@
-"""Whether a file is the weights that it should be: by its hash where this is known, otherwise by a look at its ends."""
+"""Checks of whether a file holds the right weights: by its hash where this is known, otherwise by a look at its ends."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LFS_POINTER = b"version https://git-lfs.github.com"  # What a clone without Git
 
 
 def hash_problem(path: Path, sha256: str, git_blob: str) -> str:
-    """What is wrong with a file of known hash, in words that go on from its path; "" where it is right.
+    """Say what is wrong with a file of known hash, in words that follow its path; "" where nothing is.
 
     Args:
         path: The file.
@@ -43,10 +43,10 @@ def hash_problem(path: Path, sha256: str, git_blob: str) -> str:
 
 
 def content_problem(path: Path) -> str:
-    """Why a file cannot be what its suffix says, in words that go on from its path; "" where its ends look right.
+    """Say why a file cannot be what its suffix says, in words that follow its path; "" where its ends look right.
 
-    What lies in between is left to who reads it. Files of other suffixes are only looked at for what they are not: empty, a
-    web page that came in place of a download, or a pointer of Git LFS.
+    What lies between the ends is left to the reader of the file. Files of other suffixes must only not be empty, a web page
+    that came in place of a download, or a pointer of Git LFS.
 
     Raises:
         OSError: It cannot be read.
@@ -76,7 +76,7 @@ def _safetensors_problem(path: Path) -> str:
     try:
         from safetensors import SafetensorError, safe_open
     except ImportError:
-        return ""  # Who reads the file says so.
+        return ""  # Reading the file will say so.
     try:
         with safe_open(path, "pt"):  # Compares the header with the size.
             return ""

@@ -43,7 +43,7 @@ _CONNECT_S = 5.0  # Until a host that does not answer counts as not reachable.
 _CHUNK_BYTES = 1 << 20
 _WRAPPERS = ("state_dict", "model_state_dict", "model")  # Under which training scripts store the weights.
 _OBJECT = re.compile(r"GLOBAL (\S+) was not")  # Of torch's refusal to unpickle one.
-_NAMED = 3  # Names of a list that a message has.
+_NAMED = 3  # How many names of a list a message has.
 
 
 @dataclass(frozen=True)
@@ -84,12 +84,12 @@ class WeightFile:
 
 
 def cache_directory() -> Path:
-    """``~/.cache/fus3dmaps``, or its like under ``XDG_CACHE_HOME``."""
+    """Return this package's cache: ``fus3dmaps`` in ``XDG_CACHE_HOME``, or in ``~/.cache``."""
     return Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "fus3dmaps"
 
 
 def local_path(value: str) -> Path | None:
-    """The file or directory that the value of a parameter names, where there is one."""
+    """Return the file or directory that the value of a parameter names; None where there is none."""
     try:
         path = Path(value).expanduser()
         return path if value and path.exists() else None
@@ -98,12 +98,12 @@ def local_path(value: str) -> Path | None:
 
 
 def is_hub_name(value: str) -> bool:
-    """Whether a value that names no file or directory can name a repository of the hub."""
+    """Tell whether a value that names no file or directory can name a repository of the hub."""
     return _as_hub_name(value) is not None
 
 
 def locate(value: str, file: WeightFile) -> Path | None:
-    """Path of a weight file that is on this machine already, without the network and without reading it.
+    """Find a weight file that is on this machine already, without the network and without reading it.
 
     Args:
         value: Value of the parameter, see above.
@@ -125,7 +125,7 @@ def locate(value: str, file: WeightFile) -> Path | None:
 
 
 def find_weights(parameter: str, value: str, file: WeightFile) -> Path:
-    """Path of a weight file, which is downloaded where it is published if it is nowhere on this machine.
+    """Find a weight file, and download it from where it is published if it is not on this machine.
 
     Args:
         parameter: Name of the parameter for messages, e.g. ``encoder.weights``.
@@ -150,7 +150,7 @@ def find_weights(parameter: str, value: str, file: WeightFile) -> Path:
 
 
 def only_directory(value: str) -> str:
-    """The value of a parameter where it is a directory, which any file is looked for in, and "" where it is one file's."""
+    """Return the value of a parameter if it is a directory, in which any file is looked for, and otherwise ""."""
     path = local_path(value)
     return value if path is not None and path.is_dir() else ""
 
@@ -173,7 +173,7 @@ def saying_what_to_get(parameter: str, file: WeightFile) -> Iterator[None]:
 
 
 def _find(refusal: str, parameter: str, value: str, file: WeightFile) -> tuple[Path, bool]:
-    """The file, and whether it is to be the published one, to the byte."""
+    """Find the file, and tell whether it has to be the published one, byte for byte."""
     path = local_path(value)
     if path is not None:
         name = Path(file.file_name).name
@@ -233,7 +233,7 @@ def read_state(path: Path) -> dict[str, torch.Tensor]:
 
 
 def reading_problem(error: Exception) -> str:
-    """Why a file is not read. Torch's own words advise an option under which it would run what the file holds."""
+    """Say why a file is not read; torch's own words advise an option under which it would run what the file holds."""
     text = str(error)
     if isinstance(error, pickle.UnpicklingError):
         found = _OBJECT.search(text)
@@ -275,7 +275,7 @@ def fit(module: torch.nn.Module, state: Mapping[str, torch.Tensor], what: str) -
 
 
 def _in_directory(directory: Path, name: str) -> Path:
-    """The file of this name, or one of the same name but for its suffix, which a user converted or trained."""
+    """Return the file of this name, or one with another suffix, which a user converted or trained."""
     stem = name
     while stem.endswith(_SUFFIXES):
         stem = stem.removesuffix(Path(stem).suffix)
@@ -289,7 +289,7 @@ def _as_hub_name(value: str) -> re.Match[str] | None:
 
 
 def _repository(value: str, file: WeightFile) -> tuple[str, str] | None:
-    """Repository and revision that a value without a file or directory stands for; None where it is no name of one."""
+    """Return the repository and revision that a value names which is no file or directory; None where it names none."""
     if not value:
         return file.hub, file.revision
     name = _as_hub_name(value)
@@ -300,7 +300,7 @@ def _repository(value: str, file: WeightFile) -> tuple[str, str] | None:
 
 
 def _cached(repository: str, revision: str, file: WeightFile) -> Path | None:
-    """The file in the cache of the hub's client, or in this package's own."""
+    """Find the file in the cache of the hub's client, or in this package's own."""
     found = _cached_by_hub(repository, revision, file.file_name) if repository else None
     is_published = (repository, revision) == (file.hub, file.revision)
     candidates = (*((found,) if found else ()), *((file.cached_path,) if is_published else ()))
@@ -357,7 +357,7 @@ def check_reachable(address: str) -> None:
     """Fail soon without a network; clients of the hubs wait for minutes or try again for half a one.
 
     Args:
-        address: An URL of the host that is to be asked. Behind a proxy nothing is tried: who is asked then is the proxy.
+        address: A URL of the host to try. Behind a proxy nothing is tried, since only the proxy would be asked.
 
     Raises:
         OSError: Its host cannot be reached.

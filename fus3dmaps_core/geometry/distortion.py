@@ -47,7 +47,7 @@ class Distortion:
 
 
 class Rectifier:
-    """Turns images of a camera with distortion into those of the pinhole camera with the same intrinsics.
+    """The step from images of a camera with distortion to those of the pinhole camera with the same intrinsics.
 
     Focal lengths, principal point and size stay, so that the camera model of the images stays the one that came with them;
     what a wide lens saw beyond its edges is lost, and where the lens saw nothing is 0. Depth stays what it is, for it is
@@ -59,7 +59,7 @@ class Rectifier:
 
         Args:
             intrinsics: Camera model of the images, before and after.
-            distortion: Of the lens.
+            distortion: Distortion of the lens.
         """
         self._size = (intrinsics.width, intrinsics.height)
         coefficients = np.array(distortion.coefficients)
@@ -116,7 +116,7 @@ def _is_fisheye(distortion: Distortion) -> bool:
 
 
 def _radii(intrinsics: Intrinsics) -> NDArray[np.float64]:
-    """Distance of each pixel's ray from the axis, at depth 1, (H, W)."""
+    """Compute the distance of each pixel's ray from the axis, at depth 1, (H, W)."""
     x = (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
     y = (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
     radii: NDArray[np.float64] = np.hypot(x[None, :], y[:, None])
@@ -124,7 +124,7 @@ def _radii(intrinsics: Intrinsics) -> NDArray[np.float64]:
 
 
 def _fold_radius(distortion: Distortion, largest: float) -> float:
-    """The radius (at depth 1) up to which the model is one: the distorted radius grows with it; infinite if all through.
+    """Find the radius at depth 1 up to which the distorted radius grows with it; infinite if it always does.
 
     Polynomials are fitted to what the lens sees. Beyond, they may turn back and show the image a second time, mirrored.
     """

@@ -29,7 +29,7 @@ class WorkingFrame:
 
 
 def resize_frame(frame: PosedFrame, image: ImageConfig) -> WorkingFrame:
-    """Bring a frame to the working resolution and blank what is not a usable depth.
+    """Bring a frame to the working resolution and blank depth that is not usable.
 
     Colour is resized by area or bilinearly, depth by nearest neighbour (means across an edge are points in the air), and
     the camera model with them. Depth that is 0, NaN, infinite or outside [depth_min_m, depth_max_m] becomes 0.
@@ -46,7 +46,7 @@ def resize_frame(frame: PosedFrame, image: ImageConfig) -> WorkingFrame:
 
 
 def sample_pattern(count: int) -> NDArray[np.float64]:
-    """Where in a patch pixels are sampled: a fixed pattern, so that runs repeat bit for bit.
+    """Return where in a patch pixels are sampled: a fixed pattern, so that runs repeat bit for bit.
 
     Args:
         count: Pixels per patch. 5 gives a quincunx, a square number a regular grid, any other number the first points of
@@ -83,7 +83,7 @@ class PixelSamples:
 
 @lru_cache(maxsize=16)
 def sample_pixels(height: int, width: int, rows: int, columns: int, per_patch: int) -> PixelSamples:
-    """The sampled pixels of an image that a grid of ``rows`` x ``columns`` patches covers.
+    """Sample the pixels of an image that a grid of ``rows`` x ``columns`` patches covers.
 
     Patch (r, c) spans rows r H / rows to (r + 1) H / rows, so any image size goes with any grid.
     """
@@ -104,7 +104,7 @@ def unproject(
     intrinsics: Intrinsics,
     T_world_camera: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Points in the map frame of pixels with valid depth.
+    """Turn pixels with valid depth into points in the map frame.
 
     Args:
         depth_m: (H, W) float32 metres along the optical axis.

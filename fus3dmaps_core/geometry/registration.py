@@ -23,8 +23,8 @@ def register_depth(
 
     Args:
         depth_m: (h, w) float32 metres along the axis of the depth camera.
-        depth_intrinsics: Of the depth image, without distortion.
-        rgb_intrinsics: Of the colour image, W x H pixels, without distortion.
+        depth_intrinsics: Camera model of the depth image, without distortion.
+        rgb_intrinsics: Camera model of the colour image, W x H pixels, without distortion.
         T_rgb_depth: (4, 4) rigid transform of points from the depth camera's to the colour camera's optical frame.
 
     Returns:
@@ -72,15 +72,15 @@ def _covered(
     center: float,
     size: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The first pixel that each patch covers along an axis of the colour image, and the one after the last.
+    """Find the first pixel that each patch covers along an axis of the colour image, and the one after the last.
 
     Args:
         slopes: Coordinate of the patch's centre along the axis over its depth, in the colour camera.
         approach: Its depth in the depth camera over that in the colour camera.
         R: (3, 3) rotation from the depth to the colour camera.
         axis: 0 along rows, 1 along columns.
-        pixel_size: Of the depth camera's pixels at depth 1, along both axes.
-        focal: Of the colour camera along the axis, pixels.
+        pixel_size: Size of the depth camera's pixels at depth 1, along both axes.
+        focal: Focal length of the colour camera along the axis, pixels.
         center: Its principal point, pixels.
         size: Its image, pixels.
     """
@@ -100,7 +100,7 @@ def _nearest(
     width: int,
     height: int,
 ) -> NDArray[np.float32]:
-    """The least of the depths drawn over each pixel, (height, width); 0 where there is none."""
+    """Keep the least of the depths drawn over each pixel: (height, width), 0 where there is none."""
     buffer = np.full(width * height, np.inf, np.float32)
     columns_each, rows_each = columns[1] - columns[0], rows[1] - rows[0]
     inside = np.flatnonzero((columns_each > 0) & (rows_each > 0))

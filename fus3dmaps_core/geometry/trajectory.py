@@ -28,7 +28,7 @@ class PoseBuffer:
         self._poses: list[NDArray[np.float64]] = []
 
     def __len__(self) -> int:
-        """Number of poses held."""
+        """Return the number of poses held."""
         return len(self._stamps_ns)
 
     @property
@@ -57,7 +57,7 @@ class PoseBuffer:
         self._poses.append(T)
 
     def lookup(self, stamp_ns: int) -> NDArray[np.float64] | PoseGap:
-        """The pose at a stamp: the stored one where stamps coincide, else position by lerp and rotation by slerp.
+        """Return the pose at a stamp: the stored one where stamps coincide, else position by lerp and rotation by slerp.
 
         Returns:
             A fresh (4, 4) float64 transform, or the reason why there is none. AFTER_LAST may become a pose later, the

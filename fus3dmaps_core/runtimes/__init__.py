@@ -1,1 +1,1 @@
-"""What runs the encoders' networks other than torch as it is: exported graphs in ONNX Runtime or TensorRT, torch.compile."""
+"""Runtimes of the encoders' networks other than plain torch: exported graphs in ONNX Runtime or TensorRT, torch.compile."""

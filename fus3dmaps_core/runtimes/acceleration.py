@@ -1,18 +1,18 @@
-"""The networks of a trio, run by what the configuration says instead of by torch as it is.
+"""The networks of a trio, run by the runtime that the configuration names instead of plain torch.
 
-Images alone are concerned. The text tower stays in torch: a prompt comes once in a while, and is short.
+This concerns images alone. The text tower stays in torch: prompts are rare and short.
 """
 
 from __future__ import annotations
 
 from fus3dmaps_core.config.schema import EncoderConfig, ImageConfig
-from fus3dmaps_core.encoders.graphs import Network
+from fus3dmaps_core.encoders.network_graphs import Network
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.runtimes.compiled_network import CompiledNetwork
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.exporting import NamedEncoder, ensure_exported, graph_encoders
 from fus3dmaps_core.runtimes.graph_files import graph_directory, own_precision
 from fus3dmaps_core.runtimes.image_memory import naming_image_size
-from fus3dmaps_core.runtimes.opening import open_network
 from fus3dmaps_core.runtimes.packages import import_onnxruntime, import_tensorrt
 from fus3dmaps_core.runtimes.tensorrt_network import check_cuda
 
@@ -21,20 +21,20 @@ def accelerate(trio: EncoderTrio, encoder: EncoderConfig, image: ImageConfig) ->
     """Have the networks of a trio run by ``encoder.runtime``.
 
     Graphs and engines that are not in ``encoder.graph_directory`` yet are made there, which takes minutes the first time.
-    With ``encoder.instance_embeddings: patches`` the crop encoder, which then embeds but the image of a query, stays in
-    torch.
+    With ``encoder.instance_embeddings: patches`` the crop encoder stays in torch, since it only embeds the image of a query
+    then.
 
     Args:
-        trio: As loaded; its encoders are changed.
+        trio: The trio as loaded; its encoders are changed.
         encoder: Runtime, precision, device and directory.
-        image: Size of the images that will come.
+        image: Size of the images that will be embedded.
 
     Returns:
         The trio.
 
     Raises:
         EncoderError: The runtime or its packages are missing or not for this device, an encoder has no graph, or a graph
-            cannot be made, for want of memory if the images are too large. The trio then is as it was.
+            cannot be made, for lack of memory if the images are too large. The trio then is as it was.
     """
     if encoder.runtime == "torch":
         return trio

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 import torch
 
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.static_batches import listed, run_in_batches
 
 
 class CompiledNetwork:
-    """Runs a graph's network compiled for its one shape, on its device.
+    """A graph's network compiled for its one shape, on its device.
 
     The compiler's default mode is taken. The modes with CUDA graphs hand out memory that the next batch overwrites, while an
     encoder keeps the embeddings of all batches; the autotuning ones try kernels for minutes at every start.
 
     Attributes:
-        shape: Of the input.
+        shape: Shape of the input.
     """
 
     def __init__(self, graph: Graph, trio: str, device: str) -> None:
         """Compile, which takes up to a minute, so that the first frame does not wait for it.
 
         Args:
-            graph: Whose network.
+            graph: The graph to compile.
             trio: Name of its trio, for messages.
-            device: Where it is.
+            device: Device that its network is on.
 
         Raises:
             EncoderError: There is no compiler, or it cannot compile this network.

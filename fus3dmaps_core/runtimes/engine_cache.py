@@ -1,4 +1,4 @@
-"""TensorRT engines on disk, each of use for one graph, on one kind of GPU, in one version of TensorRT."""
+"""TensorRT engines on disk: each serves one graph on one kind of GPU with one version of TensorRT."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import torch
 
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import graph_hash, slug, write_atomically
-from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB, build_engine, load_engine
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug, write_atomically
+from fus3dmaps_core.runtimes.tensorrt_engine import build_engine, load_engine
 
 _HASH_DIGITS = 16
 
@@ -34,26 +34,26 @@ class Gpu:
 
     @classmethod
     def of(cls, device: str) -> Gpu:
-        """The GPU behind a CUDA device of torch."""
+        """Describe the GPU behind a CUDA device of torch."""
         properties = torch.cuda.get_device_properties(torch.device(device))
         return cls(properties.name, (properties.major, properties.minor))
 
     @property
     def slug(self) -> str:
-        """As part of a file's name."""
+        """The GPU as part of a file's name."""
         return f"{slug(self.name)}-sm{self.capability[0]}{self.capability[1]}"
 
 
 def engine_path(directory: Path, graph: Path, shape: tuple[int, ...], precision: Precision, version: str, gpu: Gpu) -> Path:
-    """Where the engine of a graph is kept: its name has all that makes another engine necessary.
+    """Return where the engine of a graph is kept; the name holds all that makes another engine necessary.
 
     Args:
-        directory: Of engines.
-        graph: ONNX file; its name and its hash.
-        shape: Of its input.
-        precision: Of the graph.
-        version: Of TensorRT.
-        gpu: The engine's.
+        directory: Directory of engines.
+        graph: ONNX file; its name and its hash are part of the name.
+        shape: Shape of its input.
+        precision: Precision of the graph.
+        version: Version of TensorRT.
+        gpu: GPU that the engine is for.
 
     Raises:
         EncoderError: The graph cannot be read.
@@ -73,20 +73,18 @@ def cached_engine(
     precision: Precision,
     gpu: Gpu,
     directory: Path,
-    workspace_mib: int = WORKSPACE_MIB,
 ) -> tuple[Any, Path]:
-    """The engine of a graph, from its file, or built and kept there.
+    """Load the engine of a graph from its file, or build it and keep it there.
 
-    A file that TensorRT refuses, being cut short or copied from elsewhere, is replaced.
+    A file that TensorRT refuses, because it is cut short or from elsewhere, is replaced.
 
     Args:
         tensorrt: The package.
         graph: ONNX file.
-        shape: Of its input.
-        precision: Of the graph.
+        shape: Shape of its input.
+        precision: Precision of the graph.
         gpu: The current CUDA device.
-        directory: Of engines; made if it is missing.
-        workspace_mib: See :data:`fus3dmaps_core.runtimes.tensorrt_engine.WORKSPACE_MIB`.
+        directory: Directory of engines; made if it is missing.
 
     Returns:
         The engine, and where it is kept.
@@ -102,7 +100,7 @@ def cached_engine(
             return engine, path
         _log.warning("TensorRT refuses the engine '%s'; it is built anew", path)
     timings = directory / f"timings_trt{slug(version)}_{gpu.slug}.cache"
-    plan = build_engine(tensorrt, graph, timings, workspace_mib)
+    plan = build_engine(tensorrt, graph, timings)
     engine = load_engine(tensorrt, plan)
     if engine is None:
         raise EncoderError(f"graph '{graph}': TensorRT {version} cannot load the engine that it built")

@@ -1,6 +1,6 @@
-"""Images to try a graph with, as its encoder prepares them: noise, and shapes on a ground that changes slowly.
+"""Images to try a graph with, as its encoder prepares them: noise, and shapes on a smooth background.
 
-They go through the encoder's own resizing and normalisation; what would reach the network is written down in its place.
+They go through the encoder's own resizing and normalisation; what would reach the network is recorded in its place.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import CropEncoder, PatchEncoder
 from fus3dmaps_core.masks import Masks
 
@@ -25,7 +25,7 @@ _SMALLEST_CROP_PX = 24
 
 
 class _RecordedError(Exception):
-    """Ends an encoder's call where its network would have run."""
+    """The end of an encoder's call where its network would have run."""
 
 
 class GraphPatchEncoder(PatchEncoder, GraphEncoder, Protocol):
@@ -37,24 +37,24 @@ class GraphCropEncoder(CropEncoder, GraphEncoder, Protocol):
 
 
 def pictures(height: int, width: int) -> list[NDArray[np.uint8]]:
-    """Noise and shapes, two (height, width, 3) uint8 images, always the same."""
+    """Draw two (height, width, 3) uint8 images, noise and shapes, always the same."""
     rng = np.random.default_rng(_SEED)
     return [_noise(rng, height, width), _scene(rng, height, width)]
 
 
 def patch_images(encoder: GraphPatchEncoder, height: int, width: int) -> torch.Tensor:
-    """Two images of this size, pixels, as they reach the network of a patch encoder: (2, 3, H', W') float32 on the CPU."""
+    """Record how two images of this size reach the network of a patch encoder: (2, 3, H', W') float32 on the CPU."""
     graph = encoder.graph(height, width)
     return torch.cat([_record(encoder, graph, partial(encoder.encode_patches, rgb)) for rgb in pictures(height, width)])
 
 
 def crop_images(encoder: GraphCropEncoder, height: int, width: int) -> torch.Tensor:
-    """A batch of crops as they reach the network of a crop encoder: (n, 3, side, side) float32 on the CPU.
+    """Record how a batch of crops reaches the network of a crop encoder: (n, 3, side, side) float32 on the CPU.
 
     Args:
         encoder: Crop encoder.
-        height: Of the image that they are cut from, pixels.
-        width: Likewise.
+        height: Height of the image that they are cut from, pixels.
+        width: Its width, pixels.
     """
     rng = np.random.default_rng(_SEED)
     graph = encoder.graph(height, width)
@@ -69,7 +69,7 @@ def crop_images(encoder: GraphCropEncoder, height: int, width: int) -> torch.Ten
 
 
 def _record(encoder: GraphEncoder, graph: Graph, encode: Callable[[], object]) -> torch.Tensor:
-    """What the encoder would give its network, which afterwards is torch's again."""
+    """Record what the encoder gives its network; afterwards the encoder runs in torch again."""
     seen: list[torch.Tensor] = []
 
     def note(images: torch.Tensor) -> torch.Tensor:

@@ -12,13 +12,13 @@ from typing import cast
 import torch
 
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.example_images import GraphCropEncoder, GraphPatchEncoder, crop_images, patch_images
-from fus3dmaps_core.runtimes.files import external_data
 from fus3dmaps_core.runtimes.graph_files import checksum_path, graph_path, is_whole, write_checksum
-from fus3dmaps_core.runtimes.onnx_export import OPSET, plain_network, write_onnx
+from fus3dmaps_core.runtimes.onnx_writer import OPSET, plain_network, write_onnx
 from fus3dmaps_core.runtimes.packages import check_exporter, import_onnxruntime
 from fus3dmaps_core.runtimes.parity import Parity, check_parity
 
@@ -31,7 +31,7 @@ class NamedEncoder:
 
     Attributes:
         trio: Name of the trio.
-        encoder: It.
+        encoder: The encoder.
         images: Makes images, as they reach its network, from the size of a frame.
     """
 
@@ -47,10 +47,10 @@ class ExportedGraph:
     Attributes:
         name: ``patch`` or ``crop``.
         path: Its file; further weights and the checksum lie beside it.
-        size_bytes: Of the file and its weights.
-        opset: Of ONNX.
-        shape: Of its input.
-        precision: Of weights and products.
+        size_bytes: Size of the file and its weights.
+        opset: Opset of ONNX.
+        shape: Shape of its input.
+        precision: Precision of weights and products.
         parameters: How many weights the network has.
         parity: How near it is to torch.
     """
@@ -66,10 +66,10 @@ class ExportedGraph:
 
 
 def graph_encoders(trio: EncoderTrio, with_crops: bool = True) -> list[NamedEncoder]:
-    """The encoders of a trio whose networks can be run elsewhere.
+    """Return the encoders of a trio whose networks can be run elsewhere.
 
     Args:
-        trio: Whose.
+        trio: The trio.
         with_crops: Whether the crop encoder is among them.
 
     Raises:
@@ -94,18 +94,18 @@ def export_graph(encoder: NamedEncoder, precision: Precision, directory: Path, h
     """Export the graph of an encoder, check it against torch and put it into a directory under its name.
 
     Args:
-        encoder: Whose.
-        precision: Of weights and products.
+        encoder: The encoder whose graph is exported.
+        precision: Precision of weights and products.
         directory: Made if it is missing.
-        height: Of the images that it will be run on, pixels.
-        width: Likewise.
+        height: Height of the images that it will be run on, pixels.
+        width: Their width, pixels.
 
     Raises:
         EncoderError: The directory cannot be written, a package is missing, torch cannot export the network, or the file is
-            too far from it. There is no file of this name then that was not there before.
+            too far from it. No new file has this name then.
     """
     check_exporter()
-    import_onnxruntime()  # Which the file is checked with at the end.
+    import_onnxruntime()  # The file is checked with it at the end.
     graph = encoder.encoder.graph(height, width)
     path = graph_path(directory, encoder.trio, graph, precision)
     network = plain_network(graph)
@@ -128,7 +128,7 @@ def export_graph(encoder: NamedEncoder, precision: Precision, directory: Path, h
 
 
 def ensure_exported(encoder: NamedEncoder, precision: Precision, directory: Path, height: int, width: int) -> Path:
-    """The file of an encoder's graph, which is exported where there is none that is whole.
+    """Return the file of an encoder's graph, and export it where there is no whole one.
 
     Raises:
         EncoderError: As :func:`export_graph`.

@@ -1,4 +1,4 @@
-"""Graphs that others exported, brought to half precision as those of our own encoders are, for TensorRT to obey."""
+"""Graphs that others exported, rounded to half precision as those of our own encoders are, so that TensorRT obeys it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch.nn import functional
 
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import graph_hash, slug
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug
 from fus3dmaps_core.runtimes.graph_files import checksum_path, is_whole, write_checksum
 from fus3dmaps_core.runtimes.half_precision import emulate_products, round_products
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
@@ -26,7 +26,7 @@ _log = logging.getLogger(__name__)
 
 
 def in_precision(path: Path, precision: Precision, directory: Path, images: torch.Tensor) -> Path:
-    """A float32 graph whose products are taken in half precision; made where it is missing, and compared with the original.
+    """Round the products of a float32 graph to half precision, unless that was done before, and compare the two.
 
     Args:
         path: ONNX file of a float32 graph with one input of static shape.
@@ -87,7 +87,7 @@ def _check(path: Path, precision: Precision, written: Path, images: torch.Tensor
 
 
 def _channel_errors(expected: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
-    """1 - cos over all that follows the second axis, flat; of two channels of zeros, 0."""
+    """Compute 1 - cos over all that follows the second axis, flat; of two channels of zeros, 0."""
     one, other = (values.double().flatten(2).flatten(0, 1) for values in (expected, found))
     both_zero = ~(one.any(dim=1) | other.any(dim=1))
     return torch.where(both_zero, 0.0, 1.0 - functional.cosine_similarity(one, other, dim=1))

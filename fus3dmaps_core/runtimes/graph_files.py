@@ -10,27 +10,27 @@ from torch import nn
 
 from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.encoders.weights import cache_directory
-from fus3dmaps_core.runtimes.files import graph_hash, slug
-from fus3dmaps_core.runtimes.onnx_export import OPSET
+from fus3dmaps_core.runtimes.cached_files import graph_hash, slug
+from fus3dmaps_core.runtimes.onnx_writer import OPSET
 
 _FINGERPRINT_DIGITS = 16
 
 
 def graph_directory(value: str) -> Path:
-    """Where graphs and engines are kept by the parameter ``encoder.graph_directory``."""
+    """Return the directory of graphs and engines that the parameter ``encoder.graph_directory`` names."""
     return Path(value).expanduser() if value else cache_directory() / "graphs"
 
 
 def graph_path(directory: Path, trio: str, graph: Graph, precision: Precision) -> Path:
-    """Where a graph is kept: its name tells other weights, shapes, precisions and versions of this package apart."""
+    """Return where a graph is kept; the name tells weights, shapes, precisions and versions of this package apart."""
     shape = "x".join(map(str, graph.shape))
     return directory / f"{slug(trio)}_{graph.name}_{shape}_{precision}_{fingerprint(graph.network)}.onnx"
 
 
 def fingerprint(network: nn.Module) -> str:
-    """A hash of a network's class and weights and of what an export depends on besides, hexadecimal.
+    """Hash a network's class and weights and what else an export depends on, hexadecimal.
 
     Weights are taken as bfloat16, so that a network has the same one whether it was loaded in float32 or, as on CUDA, in
     bfloat16: what was exported on the CPU of one machine is found on the robot.
@@ -44,14 +44,14 @@ def fingerprint(network: nn.Module) -> str:
 
 
 def own_precision(network: nn.Module) -> Precision:
-    """The precision of a network's weights."""
+    """Return the precision of a network's weights."""
     dtype = next(value.dtype for value in network.state_dict().values() if value.is_floating_point())
     precisions: dict[torch.dtype, Precision] = {torch.float16: "fp16", torch.bfloat16: "bf16"}
     return precisions.get(dtype, "fp32")
 
 
 def checksum_path(path: Path) -> Path:
-    """Where the checksum of a graph lies."""
+    """Return where the checksum of a graph lies."""
     return path.with_name(path.name + ".sha256")
 
 
@@ -61,7 +61,7 @@ def write_checksum(path: Path) -> None:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a graph is there and is what its checksum says."""
+    """Tell whether a graph is there and is what its checksum says."""
     try:
         return checksum_path(path).read_text().split()[:1] == [graph_hash(path)]
     except (OSError, UnicodeDecodeError):

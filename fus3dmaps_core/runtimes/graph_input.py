@@ -1,4 +1,4 @@
-"""What the head of an ONNX file says, read without its weights."""
+"""The input of an ONNX file, read without its weights."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from fus3dmaps_core.runtimes.packages import import_onnx
 
 
 def input_shape(path: Path) -> tuple[int, int, int, int]:
-    """Shape of the one input of an ONNX file, (n, channels, H, W).
+    """Read the shape of the one input of an ONNX file, (n, channels, H, W).
 
     Raises:
         EncoderError: The package ``onnx`` is missing, the file cannot be read, or it has another kind of input.

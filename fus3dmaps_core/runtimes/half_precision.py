@@ -75,7 +75,7 @@ def _take_in(ir: ModuleType, graph: Any, products: tuple[str, ...], source: Any,
 
 
 def _cast_before(ir: ModuleType, graph: Any, node: Any, value: Any, target: Any) -> Any:
-    """The value in another type for a node; weights are rounded here and now."""
+    """Cast a value to another type for a node; weights are rounded at once."""
     name = f"{value.name}_as_{target.name.lower()}"
     if value.is_initializer():
         with np.errstate(over="ignore"):  # What is too large becomes infinite, and is found when the graph is run.

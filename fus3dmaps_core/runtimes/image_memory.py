@@ -1,4 +1,4 @@
-"""Images too large for memory, refused by the parameters that say their size, whoever ran out of it."""
+"""Images too large for memory: the error names the parameters of their size, whichever library ran out of memory."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ _SAID = (
 
 @contextmanager
 def naming_image_size(trio: str, height: int, width: int) -> Iterator[None]:
-    """Turn want of memory inside, on the host or a device, into a refusal that names the size of the images.
+    """Turn lack of memory inside, on the host or a device, into a refusal that names the size of the images.
 
     Args:
         trio: Name of the encoders, for the message.
-        height: Of the images that they are made ready for, pixels.
-        width: Likewise.
+        height: Height of the images that they are made ready for, pixels.
+        width: Their width, pixels.
 
     Raises:
-        EncoderError: Memory ran out; what is cached of a GPU's was given back.
+        EncoderError: Memory ran out; cached memory of a GPU was given back.
     """
     cause: str | None = None
     try:
         yield
     except Exception as error:  # Also refusals of others that go back to it, such as the compiler's.
-        cause = _want_of_memory(error)
+        cause = _lack_of_memory(error)
         if cause is None:
             raise
     if cause is not None:  # After the except clause: its exception holds the frames, and those what they had allocated.
@@ -49,8 +49,8 @@ def naming_image_size(trio: str, height: int, width: int) -> Iterator[None]:
         )
 
 
-def _want_of_memory(error: BaseException | None) -> str | None:
-    """The words of the first error, of this one and what led to it, that says that memory ran out; None without one."""
+def _lack_of_memory(error: BaseException | None) -> str | None:
+    """Find the words with which an error, or one that led to it, says that memory ran out; None without one."""
     found = None
     while error is not None:
         text = str(error).strip()

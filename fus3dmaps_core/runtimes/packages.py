@@ -16,7 +16,7 @@ HOW_TO_GET_TENSORRT = (
 
 
 def import_onnxruntime() -> ModuleType:
-    """The package ``onnxruntime``.
+    """Import the package ``onnxruntime``.
 
     Raises:
         EncoderError: It is not installed.
@@ -25,7 +25,7 @@ def import_onnxruntime() -> ModuleType:
 
 
 def import_onnx() -> ModuleType:
-    """The package ``onnx``, with which graphs are read and written.
+    """Import the package ``onnx``, with which graphs are read and written.
 
     Raises:
         EncoderError: It is not installed.
@@ -34,7 +34,7 @@ def import_onnx() -> ModuleType:
 
 
 def check_exporter() -> None:
-    """See that torch can write ONNX, for which it needs ``onnx`` and ``onnxscript``.
+    """Check that torch can write ONNX, for which it needs ``onnx`` and ``onnxscript``.
 
     Raises:
         EncoderError: One of them is not installed.
@@ -44,7 +44,7 @@ def check_exporter() -> None:
 
 
 def import_tensorrt() -> ModuleType:
-    """The package ``tensorrt``, version 10 or newer.
+    """Import the package ``tensorrt``, version 10 or newer.
 
     Raises:
         EncoderError: It is missing or older; the message says how to get it.

@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn import functional
 
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.half_precision import emulate_products
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
@@ -82,7 +82,7 @@ def check_parity(path: Path, graph: Graph, network: nn.Module, images: torch.Ten
         graph: What it was made from.
         network: Its network on the CPU in float32.
         images: (n, 3, H, W) as the encoder prepares them, any n.
-        precision: Of the file. Products in half precision are emulated, see
+        precision: Precision of the file. Products in half precision are emulated, see
             :func:`fus3dmaps_core.runtimes.half_precision.emulate_products`.
 
     Raises:
@@ -101,10 +101,10 @@ def check_parity(path: Path, graph: Graph, network: nn.Module, images: torch.Ten
 
 
 def compare(names: Sequence[str], expected: Sequence[torch.Tensor], found: Sequence[torch.Tensor], bound: Bound) -> Parity:
-    """Errors of outputs, the first of which are embeddings along the last axis.
+    """Compute the errors of outputs, the first of which are embeddings along the last axis.
 
     Args:
-        names: Of the outputs.
+        names: Names of the outputs.
         expected: Torch's.
         found: The graph's, of the same shapes.
         bound: What the errors may be.

@@ -1,4 +1,4 @@
-"""Any number of images through a graph that takes a fixed one: whole batches, the last of them padded."""
+"""Any number of images through a graph that takes a fixed number: whole batches, the last of them padded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Outputs = torch.Tensor | tuple[torch.Tensor, ...]
 
 
 def listed(outputs: Outputs) -> list[torch.Tensor]:
-    """The outputs of a graph as a list, be they one or several."""
+    """Return the outputs of a graph as a list, whether one or several."""
     return [outputs] if isinstance(outputs, torch.Tensor) else list(outputs)
 
 

@@ -8,7 +8,7 @@ from types import ModuleType
 from typing import Any
 
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.files import write_atomically
+from fus3dmaps_core.runtimes.cached_files import write_atomically
 
 WORKSPACE_MIB = 2048
 """Scratch memory that an engine may take while it runs; more lets TensorRT choose from more kernels."""
@@ -16,15 +16,14 @@ WORKSPACE_MIB = 2048
 _log = logging.getLogger(__name__)
 
 
-def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path, workspace_mib: int = WORKSPACE_MIB) -> bytes:
+def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path) -> bytes:
     """Build the engine of an ONNX file for the current CUDA device; takes minutes.
 
     Args:
         tensorrt: The package.
         path: ONNX file; weights outside of it are found beside it.
-        timing_cache: File of what kernels took in earlier builds on this GPU, by which later ones are faster; it is made, or
-            brought up to date.
-        workspace_mib: See :data:`WORKSPACE_MIB`.
+        timing_cache: File with the times that kernels took in earlier builds on this GPU, which make later builds faster;
+            it is made or updated.
 
     Returns:
         The serialised engine.
@@ -41,7 +40,7 @@ def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path, workspace
         problem = parser.get_error(0).desc() if parser.num_errors else "no reason given"
         raise EncoderError(f"graph '{path}': TensorRT {tensorrt.__version__} cannot read it: {_line(problem)}")
     config = builder.create_builder_config()
-    config.set_memory_pool_limit(tensorrt.MemoryPoolType.WORKSPACE, workspace_mib << 20)
+    config.set_memory_pool_limit(tensorrt.MemoryPoolType.WORKSPACE, WORKSPACE_MIB << 20)
     # By default float32 sums are taken in TF32, a thousandth apart from what the file was checked with.
     config.clear_flag(tensorrt.BuilderFlag.TF32)
     cache = config.create_timing_cache(_read(timing_cache))
@@ -60,7 +59,7 @@ def build_engine(tensorrt: ModuleType, path: Path, timing_cache: Path, workspace
 
 
 def load_engine(tensorrt: ModuleType, plan: bytes) -> Any | None:
-    """An engine from its serialised form; None where TensorRT refuses it, being of another version or GPU, or damaged."""
+    """Load a serialised engine; None where TensorRT refuses it as damaged, or of another version or GPU."""
     return tensorrt.Runtime(_logger(tensorrt)).deserialize_cuda_engine(plan)
 
 

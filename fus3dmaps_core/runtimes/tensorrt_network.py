@@ -15,11 +15,10 @@ from fus3dmaps_core.runtimes.engine_cache import Gpu, cached_engine
 from fus3dmaps_core.runtimes.graph_input import input_shape
 from fus3dmaps_core.runtimes.packages import import_tensorrt
 from fus3dmaps_core.runtimes.static_batches import run_in_batches
-from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB
 
 
 class TensorRTNetwork:
-    """Images in, one or several tensors out, as the engine says. Safe to use from several threads, one at a time runs.
+    """Images in, one or several tensors out, as the engine says. Safe to use from several threads; one runs at a time.
 
     Nothing passes through the host: inputs and outputs are torch's own memory, and the work is queued in torch's current
     stream, after what is queued there for the images and before what will be for the outputs.
@@ -36,7 +35,7 @@ class TensorRTNetwork:
             tensorrt: The package.
             engine: An ``ICudaEngine`` with one input and static shapes, all tensors float32.
             device: CUDA device that it was built on.
-            name: Of the graph, for messages.
+            name: Name of the graph, for messages.
 
         Raises:
             EncoderError: It is another kind of engine, or there is no memory for it.
@@ -90,17 +89,17 @@ class TensorRTNetwork:
         return found
 
 
-def engine_of(
-    path: Path, device: str, precision: Precision, directory: Path, workspace_mib: int = WORKSPACE_MIB
-) -> tuple[TensorRTNetwork, Path]:
-    """The engine of an ONNX file as a network, and its file; it is built where there is none yet, which takes minutes.
+def engine_of(path: Path, device: str, precision: Precision, directory: Path) -> tuple[TensorRTNetwork, Path]:
+    """Open the engine of an ONNX file as a network; build it first where there is none, which takes minutes.
 
     Args:
         path: ONNX file with one float32 input of static shape and float32 outputs.
         device: CUDA device.
-        precision: Of the graph.
+        precision: Precision of the graph.
         directory: Where engines are kept; made if it is missing.
-        workspace_mib: See :data:`fus3dmaps_core.runtimes.tensorrt_engine.WORKSPACE_MIB`.
+
+    Returns:
+        The network, and the file of its engine.
 
     Raises:
         EncoderError: The device is no CUDA device, TensorRT is missing, or the engine cannot be built or kept.
@@ -108,12 +107,12 @@ def engine_of(
     check_cuda(device)
     tensorrt, shape = import_tensorrt(), input_shape(path)
     with torch.cuda.device(torch.device(device)):
-        engine, kept = cached_engine(tensorrt, path, shape, precision, Gpu.of(device), directory, workspace_mib)
+        engine, kept = cached_engine(tensorrt, path, shape, precision, Gpu.of(device), directory)
         return TensorRTNetwork(tensorrt, engine, device, path.name), kept
 
 
 def check_cuda(device: str) -> None:
-    """See that a device is one that TensorRT runs on.
+    """Check that TensorRT runs on a device.
 
     Raises:
         EncoderError: It is no CUDA device.

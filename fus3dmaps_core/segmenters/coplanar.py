@@ -1,4 +1,4 @@
-"""Joins neighbouring segments that lie in one plane.
+"""The union of neighbouring segments that lie in one plane.
 
 Inverse depth is affine in pixel coordinates on a plane, 1/z = a u + b v + c, whatever the camera's focal length. Segments
 are joined as long as one such fit explains both sides to within a relative depth error, the best-fitting pair first. All
@@ -18,7 +18,7 @@ _MIN_READINGS = 30  # Below this a plane fits anything.
 
 
 class _Moments:
-    """Sums over the depth readings of a region, weighted such that residuals are relative depth errors."""
+    """Sums over the depth readings of a region, weighted so that residuals are relative depth errors."""
 
     def __init__(self, normal: NDArray[np.float64], right: NDArray[np.float64], readings: float) -> None:
         self.normal, self.right, self.readings = normal, right, readings
@@ -32,7 +32,7 @@ class _Moments:
         return np.asarray(np.linalg.solve(self.normal + ridge, self.right), np.float64)
 
     def error(self, plane: NDArray[np.float64]) -> float:
-        """Root mean square of the relative error of depth under a plane."""
+        """Compute the root mean square of the relative error of depth under a plane."""
         square = plane @ self.normal @ plane - 2 * plane @ self.right + self.readings
         return math.sqrt(max(float(square), 0.0) / self.readings)
 
@@ -91,7 +91,7 @@ def join_coplanar(
 
 
 def adjacent_pairs(labels: NDArray[np.integer]) -> NDArray[np.int64]:
-    """(m, 2) int64, pairs a < b of labels that touch along a pixel's edge, sorted."""
+    """List the pairs a < b of labels that touch along a pixel's edge, sorted: (m, 2) int64."""
     pairs = np.concatenate(
         [
             np.stack([labels[:, :-1].ravel(), labels[:, 1:].ravel()], axis=1),

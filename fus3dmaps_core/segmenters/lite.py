@@ -45,7 +45,7 @@ def load(encoder: EncoderConfig, weights: str) -> LiteSegmenter:
 
 
 class LiteSegmenter:
-    """Proposes segments, planes and filled detections. Safe to use from several threads."""
+    """The segmenter ``lite``, which proposes segments, planes and filled detections. Safe to use from several threads."""
 
     def __init__(self, detector: Detector) -> None:
         """Keep the detector."""
@@ -81,7 +81,7 @@ class LiteSegmenter:
     def _filled_boxes(
         self, rgb: NDArray[np.uint8], labels: NDArray[np.int32], areas: NDArray[np.int_], depth_m: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """(k, h, w) masks of the detections at the size of ``labels``."""
+        """Fill the boxes of the detections with segments: (k, h, w) masks at the size of ``labels``."""
         detections = self._detector.detect(rgb)
         scale = np.array(labels.shape[::-1] * 2, np.float32) / np.array(rgb.shape[1::-1] * 2, np.float32)
         masks = [
@@ -92,7 +92,7 @@ class LiteSegmenter:
 
 
 def _strongest(detections: Detections) -> list[int]:
-    """Rows of confident detections whose boxes do not overlap a stronger one's too much."""
+    """Return the rows of confident detections whose boxes do not overlap a stronger one's too much."""
     overlaps = box_iou(detections.boxes, detections.boxes)
     kept: list[int] = []
     for row in np.flatnonzero(detections.scores >= _MIN_SCORE):
@@ -104,7 +104,7 @@ def _strongest(detections: Detections) -> list[int]:
 def _fill(
     box: NDArray[np.int_], labels: NDArray[np.int32], depth_m: NDArray[np.float32], areas: NDArray[np.int_]
 ) -> NDArray[np.bool_]:
-    """The part of a box that shows its object: segments that lie mostly inside and not far behind the nearest ones."""
+    """Mark the object in a box: the segments that lie mostly inside and not far behind the nearest ones."""
     window = np.s_[max(0, box[1]) : box[3], max(0, box[0]) : box[2]]
     mask = np.zeros(labels.shape, bool)
     inside, depth = labels[window], depth_m[window]
@@ -121,7 +121,7 @@ def _fill(
 
 
 def _background_depth_m(depth_m: NDArray[np.float32]) -> float:
-    """Depth behind which a box shows background: the split of its inverse depths that separates them best, if far apart."""
+    """Find the depth behind which a box shows background: where its inverse depths split best, if far apart."""
     readings = np.sort(depth_m[depth_m > 0].astype(np.float64))
     if len(readings) < 2:
         return float("inf")
@@ -134,7 +134,7 @@ def _background_depth_m(depth_m: NDArray[np.float32]) -> float:
 
 
 def _inner_radii_px(labels: NDArray[np.int32]) -> NDArray[np.float32]:
-    """(n,) float32, radius of the largest disc inside each segment, about; slivers along edges have a small one."""
+    """Estimate the radius of the largest disc inside each segment: (n,) float32, small for slivers along edges."""
     interior = np.ones(labels.shape, np.uint8)
     interior[:, 1:] &= labels[:, 1:] == labels[:, :-1]
     interior[1:] &= labels[1:] == labels[:-1]
@@ -146,13 +146,13 @@ def _inner_radii_px(labels: NDArray[np.int32]) -> NDArray[np.float32]:
 def _iou_with_unions(
     mask: NDArray[np.bool_], labels: NDArray[np.int32], chosen: NDArray[np.bool_], areas: NDArray[np.int_]
 ) -> NDArray[np.float64]:
-    """Intersection over union of a mask with unions of segments; ``chosen`` is (unions, segments)."""
+    """Compute the intersection over union of a mask with unions of segments; ``chosen`` is (unions, segments)."""
     shared = chosen @ np.bincount(labels[mask], minlength=len(areas))
     return np.asarray(shared / (mask.sum() + chosen @ areas - shared), np.float64)
 
 
 def _enlarged(masks: NDArray[np.bool_], height: int, width: int) -> Masks:
-    """Masks at another size, each pixel taking the nearest one's value."""
+    """Bring masks to another size, each pixel taking the nearest one's value."""
     small_height, small_width = masks.shape[1:]
     columns = np.arange(width) * small_width // width
     rows = np.arange(height) * small_height // height

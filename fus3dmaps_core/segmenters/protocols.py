@@ -1,4 +1,4 @@
-"""What the pipeline asks of a segmenter."""
+"""What the pipeline needs from a segmenter."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fus3dmaps_core.masks import Masks
 
 
 class Segmenter(Protocol):
-    """Cuts an image into masks that may be objects, parts of objects or groups of them."""
+    """A segmenter, which cuts an image into masks that may be objects, parts of objects or groups of them."""
 
     def segment(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Masks:
         """Propose masks.

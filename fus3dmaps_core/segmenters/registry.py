@@ -18,12 +18,12 @@ _SEGMENTERS = {
 
 
 def names() -> list[str]:
-    """Names of the known segmenters."""
+    """List the names of the known segmenters."""
     return sorted(_SEGMENTERS)
 
 
 def load_segmenter(name: str, encoder: EncoderConfig, weights: str = "") -> Segmenter:
-    """Load a segmenter; its module's ``load(encoder, weights)`` builds it.
+    """Load a segmenter by the ``load(encoder, weights)`` of its module.
 
     Args:
         name: Registry name.

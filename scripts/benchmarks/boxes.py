@@ -50,12 +50,12 @@ class Box:
 
 
 def surface_points(voxels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return a point on the surface in each of a box's voxels: (n, 3) metres."""
+    """Pick a point on the surface in each of a box's voxels: (n, 3) metres."""
     return np.asarray((voxels + _FACE_OFFSET) * VOXEL_SIZE_M, np.float64)
 
 
 def voxels_of(points_m: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the voxel of each point (n, 3): floor(p / size) per axis."""
+    """Compute the voxel of each point (n, 3): floor(p / size) per axis."""
     return np.floor(points_m / VOXEL_SIZE_M).astype(np.int64)
 
 

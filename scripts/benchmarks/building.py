@@ -1,4 +1,4 @@
-"""A furnished building without end: rooms on a square grid, numbered outwards from the first."""
+"""An endless furnished building: rooms on a square grid, numbered outwards from the first."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Room:
     boxes: list[Box]
 
     def voxels(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the distinct voxels of all surfaces, (n, 3) int64 in order of indices, and each one's label, (n,) int64."""
+        """List the distinct voxels of all surfaces, (n, 3) int64 ordered by index, and the label of each, (n,) int64."""
         parts = [box.voxels() for box in self.boxes]
         voxels, first = np.unique(np.concatenate([part[0] for part in parts]), axis=0, return_index=True)
         return voxels, np.concatenate([part[1] for part in parts])[first]

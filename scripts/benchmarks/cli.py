@@ -102,7 +102,7 @@ def bench(
 
 
 def _numbers(option: str, text: str, least: int) -> list[int]:
-    """Read numbers such as 10000, 10k or 2M from a comma-separated list."""
+    """Parse numbers such as 10000, 10k or 2M from a comma-separated list."""
     numbers = []
     for item in (part.strip() for part in text.split(",") if part.strip()):
         digits, factor = (item[:-1], {"k": 1000, "M": 1_000_000}[item[-1]]) if item[-1] in "kM" else (item, 1)

@@ -48,7 +48,7 @@ class Sample:
     """The state of the run at one keyframe.
 
     Attributes:
-        keyframe: Which one.
+        keyframe: Number of the keyframe.
         resident_bytes: Resident memory of the process.
         whole_map_bytes: What the map says that keys, colours, hypotheses and instances take: all that may grow.
         dense_bytes: What it says that the dense layer takes.
@@ -63,7 +63,7 @@ class Sample:
 
 
 def corridor_boxes(position_m: float) -> list[Box]:
-    """Return the corridor along x, from 1 m behind a position to past the depth limit, and the boxes on its floor."""
+    """Make the corridor along x, from 1 m behind a position to past the depth limit, and the boxes on its floor."""
     first = int(position_m / VOXEL_SIZE_M) - 20
     last = first + 20 + int((_DEPTH_MAX_M + 2.0) / VOXEL_SIZE_M)
     boxes = [Box((first, 0, 0), (last, _SIDE_VOXELS, _SIDE_VOXELS), 0, is_room=True)]
@@ -141,12 +141,12 @@ def measure_corridor(run: Run, dimension: int, dtype: str, keyframes: int, lengt
 
 
 def fitted_slope(at: Sequence[float], values: Sequence[float]) -> float:
-    """Return the slope of the least-squares line through the values."""
+    """Fit a least-squares line through the values and return its slope."""
     return float(np.polyfit(np.asarray(at, np.float64), np.asarray(values, np.float64), 1)[0])
 
 
 def resident_bytes() -> int:
-    """Return the resident memory of this process, as Linux tells it."""
+    """Read the resident memory of this process from Linux."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()
 
@@ -154,7 +154,7 @@ def resident_bytes() -> int:
 def _process(
     semantic_map: SemanticMap, observed: ObservedObjects, view: View, camera_m: NDArray[np.float64], fuses: bool
 ) -> float:
-    """Map one keyframe and return what it costs the map, seconds."""
+    """Process a keyframe and return how long the map took, seconds."""
     patches = PATCH_ROWS * PATCH_COLUMNS
     patch_objects = np.zeros(patches, np.int64)
     patch_objects[view.patches] = view.labels

@@ -20,7 +20,7 @@ def unit_vectors(count: int, dimension: int, rng: np.random.Generator) -> NDArra
 
 
 class ObservedObjects:
-    """Observations of objects: cheap to make, for both parts come from tables."""
+    """Observations of objects; cheap to make, since both parts come from tables."""
 
     def __init__(self, dimension: int, seed: int) -> None:
         """Draw the tables.
@@ -34,7 +34,7 @@ class ObservedObjects:
         self._noise = unit_vectors(_NOISES, dimension, self._rng) * np.float32(NOISE)
 
     def observe(self, objects: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return one observation of each object: (n, d) float32, not of unit length."""
+        """Draw one observation of each object: (n, d) float32, not of unit length."""
         noise = self._noise[self._rng.integers(0, _NOISES, len(objects))]
         return np.asarray(self.directions[objects % _DIRECTIONS] + noise)
 
@@ -43,7 +43,7 @@ class KnownText:
     """A text encoder that answers every prompt with one vector.
 
     Attributes:
-        space: That of maps which do not say whose embeddings they hold.
+        space: Empty, as in maps that do not say whose embeddings they hold.
     """
 
     space = ""

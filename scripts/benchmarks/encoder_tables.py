@@ -31,10 +31,10 @@ def with_ratios(figures: Sequence[Figures]) -> list[dict[str, Any]]:
 
 
 def print_models(figures: Sequence[Figures], console: Console) -> None:
-    """Print pairs and segmenters in a table each, and the models that failed under them."""
+    """Print trios and segmenters in a table each, and the models that failed under them."""
     console.width = max(console.width, _WIDTH)
     measured = [model for model in figures if "frame" in model]
-    pairs, segmenters = ([model for model in measured if model["kind"] == kind] for kind in ("pair", "segmenter"))
+    trios, segmenters = ([model for model in measured if model["kind"] == kind] for kind in ("trio", "segmenter"))
     if measured:
         first = measured[0]
         height, width = first["image_size"]
@@ -43,9 +43,9 @@ def print_models(figures: Sequence[Figures], console: Console) -> None:
             "(samples); 2 FLOP for a product and its sum; M = 10^6, GB = 10^9 bytes; load from the page cache.",
             soft_wrap=True,
         )
-    if pairs:
-        console.print(_pair_sizes(pairs))
-        console.print(_pair_times(pairs))
+    if trios:
+        console.print(_trio_sizes(trios))
+        console.print(_trio_times(trios))
     if segmenters:
         console.print(_segmenter_table(segmenters))
     for note in dict.fromkeys(note for model in measured for note in _notes(model)):
@@ -55,13 +55,13 @@ def print_models(figures: Sequence[Figures], console: Console) -> None:
             console.print(f"{model['kind']} {model['name']}: {model['problem']}", style="red", markup=False, soft_wrap=True)
 
 
-def _pair_sizes(pairs: Sequence[Figures]) -> Table:
+def _trio_sizes(trios: Sequence[Figures]) -> Table:
     table = _table(
-        "encoder pairs: size and work",
-        ("pair",),
+        "encoder trios: size and work",
+        ("trio",),
         ("d", "image M", "text M", "frame px", "patches", "crop px", "GFLOP a frame", "GFLOP a crop"),
     )
-    for model in pairs:
+    for model in trios:
         table.add_row(
             model["name"],
             str(model["dimension"]),
@@ -76,10 +76,10 @@ def _pair_sizes(pairs: Sequence[Figures]) -> Table:
     return table
 
 
-def _pair_times(pairs: Sequence[Figures]) -> Table:
-    right = ("a frame", "/ lite's", "a crop", "in a batch of", "a prompt", *_last_names(pairs))
-    table = _table("encoder pairs: time and memory", ("pair", "runtime"), right)
-    for model in pairs:
+def _trio_times(trios: Sequence[Figures]) -> Table:
+    right = ("a frame", "/ lite's", "a crop", "in a batch of", "a prompt", *_last_names(trios))
+    table = _table("encoder trios: time and memory", ("trio", "runtime"), right)
+    for model in trios:
         estimated = model["prompt_measured_sentences"] < model["prompt_sentences"]
         table.add_row(
             model["name"],

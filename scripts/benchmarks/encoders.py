@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 @app.command()
 def bench(
-    pairs: Annotated[str, typer.Option(help="Encoder pairs, comma-separated, or none.")] = ",".join(encoders.names()),
+    trios: Annotated[str, typer.Option(help="Encoder trios, comma-separated, or none.")] = ",".join(encoders.names()),
     segmenter_names: Annotated[
         str, typer.Option("--segmenters", help="Segmenters without a file, comma-separated, or none.")
     ] = "lite,sam2",
@@ -71,7 +71,7 @@ def bench(
     Random weights are made in a scratch directory (TMPDIR), up to 3 GB at once, and are gone afterwards.
     """
     known_segmenters = [name for name in segmenters.names() if name != "fastsam"]  # Which --fastsam is for.
-    models = [("pair", name, "") for name in _names("--pairs", pairs, encoders.names())]
+    models = [("trio", name, "") for name in _names("--trios", trios, encoders.names())]
     models += [("segmenter", name, "") for name in _names("--segmenters", segmenter_names, known_segmenters)]
     models += [("segmenter", "fastsam", str(path.resolve())) for path in fastsam or ()]
     cores = usable_cores()

@@ -41,7 +41,7 @@ class Run:
         backend: Which kernels the maps use; None leaves the choice to the map.
         threads: Threads of torch and of compiled code.
         repeats: Rounds over the keyframes, and timed calls of what has no keyframe.
-        say: Told what is being done.
+        say: Called with what is being done.
     """
 
     world: World
@@ -69,7 +69,7 @@ class FilledMap:
         """Fill a map.
 
         Args:
-            run: Of which run.
+            run: The run that the map belongs to.
             voxels: How many voxels it gets.
             dimension: Embedding width d.
             dtype: Storage type.
@@ -88,7 +88,7 @@ class FilledMap:
         return self.run.params(self.voxels, self.dimension, self.dtype, **further)
 
     def forget_fresh(self, keyframe: DenseKeyframe) -> None:
-        """Bring the map to where it was before the robot saw what is new in the keyframe."""
+        """Remove from the map what the keyframe is the first to see."""
         self.map.remove_voxels(keyframe.fresh_points_m)
 
     def update_dense(self, keyframe: DenseKeyframe, embeddings: NDArray[np.float32]) -> None:
@@ -123,7 +123,7 @@ def measure_dense_updates(maps: Sequence[FilledMap], keyframes: Sequence[DenseKe
 
 
 def measure_instance_updates(maps: Sequence[FilledMap], keyframes: Sequence[ProposalKeyframe]) -> list[Measurement]:
-    """Measure instance_update: all proposals of a keyframe are associated, on maps that differ in instances alive."""
+    """Measure instance_update: all proposals of a keyframe, on maps that differ in instances alive."""
     samples: list[list[float]] = [[] for _ in maps]
     known = [0 for _ in maps]
     run = maps[0].run
@@ -159,7 +159,7 @@ def measure_instance_updates(maps: Sequence[FilledMap], keyframes: Sequence[Prop
 def measure_fusion(
     filled: FilledMap, keyframes: Sequence[DenseKeyframe], masks: Sequence[ProposalKeyframe]
 ) -> list[Measurement]:
-    """Measure full_fusion of a map that changed, its bandwidth, and incremental_fusion after one more keyframe."""
+    """Measure full_fusion of a changed map, its bandwidth, and incremental_fusion after one more keyframe of both kinds."""
     run = filled.run
 
     def keyframe_before(index: int) -> None:
@@ -178,7 +178,7 @@ def measure_fusion(
 
 
 def measure_queries(filled: FilledMap) -> Iterator[Measurement]:
-    """Measure text_query: one prompt asked of each layer of a fused map, with its answer, without encoding the text."""
+    """Measure text_query: one prompt asked of each layer of a fused map, with the whole answer but without encoding it."""
     filled.map.fuse()
     text = KnownText(filled.observed.directions[7])
     for layer in LAYERS:
@@ -191,7 +191,7 @@ def measure_queries(filled: FilledMap) -> Iterator[Measurement]:
 
 
 def measure_memory(filled: FilledMap) -> list[Measurement]:
-    """Measure dense_bytes_per_voxel (keys, hash, weights, embeddings) and instance_bytes (instances, hypotheses)."""
+    """Measure dense_bytes_per_voxel (keys, hash, weights, embeddings) and instance_bytes (instances and all hypotheses)."""
     held = filled.map.nbytes()
     dense, instances = filled.map.dense_voxel_count, filled.map.instance_count
     return [
@@ -201,11 +201,11 @@ def measure_memory(filled: FilledMap) -> list[Measurement]:
 
 
 def instance_levels(voxels: int, wanted: Sequence[int]) -> list[int]:
-    """Return those numbers of instances that a map of this size has room for."""
+    """Return the numbers of instances that a map of this size has room for."""
     return [level for level in wanted if level * _MIN_VOXELS_PER_INSTANCE <= voxels]
 
 
 def _bandwidth(name: str, filled: FilledMap, times: Times, further: dict[str, Any]) -> Measurement:
-    """Return GB/s over the bytes of the dense rows: dense voxels x d x bytes of an element."""
+    """Compute GB/s over the bytes of the dense rows: dense voxels x d x bytes of an element."""
     size = filled.map.dense_voxel_count * filled.dimension * ELEMENT_BYTES[filled.dtype]
     return Measurement(name, filled.params(**further), size / times.median_ms / 1e6, "GB/s")

@@ -1,4 +1,4 @@
-"""Arithmetic of a network, counted while it runs in torch or read from an ONNX file; 2 for a product and its sum."""
+"""The arithmetic of a network, counted while it runs in torch or read from an ONNX file; 2 for a product and its sum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import torch
 from torch.nn.attention import SDPBackend, sdpa_kernel
 from torch.utils.flop_counter import FlopCounterMode
 
-from fus3dmaps_core.encoders.lite.weights import DETECTOR_GRAPH, DETECTOR_LAYOUT
+from fus3dmaps_core.encoders.lite.packaged_files import DETECTOR_GRAPH, DETECTOR_LAYOUT
 
 DETECTOR_INPUT = (1, 3, 300, 300)
 """Of the detector that ``lite`` has beside its classifier."""
@@ -77,7 +77,7 @@ def _flops_of(node: Any, shapes: dict[str, tuple[int, ...]]) -> int:
 
 
 def count_detector() -> tuple[int, int]:
-    """Count the weights of the detector of ``lite``, and the operations of its convolutions on one image.
+    """Count the weights of the detector of ``lite``, and the floating-point operations of its convolutions on one image.
 
     Raises:
         EncoderError: The package that brings it is missing or altered.

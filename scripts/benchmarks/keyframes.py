@@ -104,7 +104,7 @@ def look_ahead(
 
 
 def robot_path(keyframes: int) -> NDArray[np.float64]:
-    """Return camera positions in the first room, 0.1 m apart: (n, 3) metres."""
+    """Place the camera along a path in the first room, 0.1 m apart: (n, 3) metres."""
     ahead_m = 0.6 + STEP_M * np.arange(keyframes)
     return np.stack([ahead_m, np.full(keyframes, 1.75), np.full(keyframes, 1.3)], axis=1)
 
@@ -135,7 +135,7 @@ def dense_keyframe(boxes: list[Box], camera_m: NDArray[np.float64], points: int,
 def mask_keyframe(
     boxes: list[Box], camera_m: NDArray[np.float64], rng: np.random.Generator, masks: int = 40
 ) -> ProposalKeyframe:
-    """Propose the largest masks of a view, 9 pixels sampled per patch, largest first."""
+    """Make the largest masks of a view, 9 pixels sampled per patch, largest first."""
     view = look_ahead(boxes, camera_m, sample_pixels(HEIGHT, WIDTH, PATCH_ROWS, PATCH_COLUMNS, 9), rng)
     members = _largest(part_labels(view.points_m, view.labels, PART_M), masks)
     return _as_proposals(view, members)
@@ -155,13 +155,13 @@ def detection_keyframe(
 
 
 def part_labels(points_m: NDArray[np.float64], labels: NDArray[np.int64], cell_m: float) -> NDArray[np.int64]:
-    """Give parts of surfaces near the origin a number: one for each surface and cell of a grid, (n,) int64."""
+    """Label the parts of surfaces near the origin, one number for each surface and cell of a grid: (n,) int64."""
     cells = np.floor(points_m / cell_m).astype(np.int64) + 64
     return ((labels * 128 + cells[:, 0]) * 128 + cells[:, 1]) * 128 + cells[:, 2]
 
 
 def object_colors(labels: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """Return a colour for each object: (n, 3) uint8."""
+    """Choose a colour for each object: (n, 3) uint8."""
     return np.stack([(labels * step + 40) % 256 for step in (37, 101, 173)], axis=1).astype(np.uint8)
 
 

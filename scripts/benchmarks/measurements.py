@@ -24,7 +24,7 @@ class Measurement:
 
     Attributes:
         name: What was measured.
-        params: Of what; map_voxels, d and dtype wherever they apply.
+        params: What it was measured of; map_voxels, d and dtype wherever they apply.
         value: The figure, a median where there are samples.
         unit: Its unit; "1" for a ratio.
         spread: Smallest, quartiles, largest and number of the samples, in the same unit; empty without samples.

@@ -1,4 +1,4 @@
-"""What is said of a vision model, and the means to find it out."""
+"""The figures of a vision model, and helpers to measure them."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ class Job:
     """What is to be measured.
 
     Attributes:
-        kind: ``pair`` or ``segmenter``.
+        kind: ``trio`` or ``segmenter``.
         name: Registry name.
         device: Torch device.
         runtime: ``encoder.runtime``.
         precision: ``encoder.precision``, of TensorRT engines.
-        threads: Of torch.
-        height: Of a frame, pixels.
-        width: Likewise.
+        threads: Threads of torch.
+        height: Height of a frame, pixels.
+        width: Its width, pixels.
         repeats: Samples of a figure, at most.
         budget_s: What the samples of a figure may take together, about, seconds.
         weights: ``encoder.weights`` or ``segmenter.weights``.
-        random: Whether random weights are to be made; ``weights`` then is of no account until they are.
+        random: Whether random weights are to be made; ``weights`` is ignored until they are.
         folder: Scratch directory of this model alone.
         code: Whose code builds the network: ``installed``, or for RADIO's beside random weights ``RADIO's own`` or
             ``stand-in``.
@@ -58,9 +58,9 @@ class Job:
 
     @property
     def encoder(self) -> EncoderConfig:
-        """How encoders and segmenters are run; graphs and engines lie in the scratch directory."""
+        """The settings that encoders and segmenters are run with; graphs and engines lie in the scratch directory."""
         return EncoderConfig(
-            name=self.name if self.kind == "pair" else "lite",
+            name=self.name if self.kind == "trio" else "lite",
             device=self.device,
             runtime=self.runtime,
             precision=self.precision,
@@ -73,9 +73,9 @@ class Seconds:
     """What a call takes.
 
     Attributes:
-        best: Of the samples, seconds.
-        median: Likewise.
-        samples: How many.
+        best: Shortest of the samples, seconds.
+        median: Median of the samples, seconds.
+        samples: Number of samples.
     """
 
     best: float
@@ -84,42 +84,42 @@ class Seconds:
 
     @classmethod
     def of(cls, samples_s: Iterable[float], share: float = 1.0) -> Seconds:
-        """Summarize samples, each times a share, e.g. one over the size of a batch."""
+        """Summarise samples, each times a share, e.g. one over the size of a batch."""
         values = [share * sample for sample in samples_s]
         return cls(min(values), float(np.median(values)), len(values))
 
 
 @dataclass(frozen=True)
 class ModelFigures:
-    """One model.
+    """The figures of one model.
 
     Attributes:
-        kind: ``pair`` or ``segmenter``.
+        kind: ``trio`` or ``segmenter``.
         name: Registry name, of a segmenter from a file with the file's.
         device: Torch device.
         runtime: What ran the image networks.
-        precision: Of their weights.
-        threads: Of torch.
+        precision: Precision of their weights.
+        threads: Threads of torch.
         weights: ``random``, or where they came from.
         code: Whose code built the network, as in :class:`Job`.
         image_size: Height and width of a frame, pixels.
-        image_parameters: Of all networks that see images, each counted once; None where it has none.
-        text_parameters: Of the text tower.
+        image_parameters: Weights of all networks that see images, each counted once; None where it has none.
+        text_parameters: Weights of the text tower.
         dimension: Embedding width d.
         frame_input: Shape of what the frame's network takes, (n, 3, H, W).
-        crop_input: Of what the crops' network takes at once.
+        crop_input: Shape of what the crops' network takes at once.
         patch_grid: Rows and columns.
         frame_gflop: 10^9 floating-point operations of a frame, 2 for a product and its sum.
-        crop_gflop: Of a crop.
+        crop_gflop: The same of a crop.
         load_s: Loading from files that the page cache holds, seconds.
         prepare_s: Opening the runtime after that, compilation included, seconds; 0 for torch.
-        first_frame_s: The first frame, which warms up.
-        frame: A frame.
-        crop: A crop, in a batch of so many.
+        first_frame_s: Time of the first frame, which warms up, seconds.
+        frame: Time of a frame.
+        crop: Time of a crop, in a batch of ``crop_batch``.
         crop_batch: How many crops were embedded at once.
-        prompt: A prompt, in all of its sentences.
+        prompt: Time of a prompt, in all of its sentences.
         prompt_sentences: Sentences that a prompt is embedded in.
-        prompt_measured_sentences: So many were timed, and the time of a prompt was worked out from theirs.
+        prompt_measured_sentences: How many of them were timed; the time of a prompt is worked out from theirs.
         loaded_resident_bytes: Resident memory of the process after loading, interpreter and libraries included.
         peak_resident_bytes: The most that it was.
         peak_device_bytes: The most that torch held on a CUDA device; None elsewhere.
@@ -184,7 +184,7 @@ def parameters_of(modules: Iterable[nn.Module]) -> dict[int, int]:
 
 
 def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
-    """Collect the modules that an object's attributes hold, or theirs in turn."""
+    """Find the modules in an object's attributes, and in theirs in turn."""
     if isinstance(value, nn.Module):
         return [value]
     if depth == 0 or not hasattr(value, "__dict__"):
@@ -193,7 +193,7 @@ def modules_in(value: Any, depth: int = 2) -> list[nn.Module]:
 
 
 def resident_bytes(field: str) -> int:
-    """Return the memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
+    """Read the resident memory of this process by its field in /proc/self/status: ``VmRSS``, or its peak ``VmHWM``.
 
     The peak that getrusage tells is inherited from the parent.
     """

@@ -19,9 +19,9 @@ import torch
 from numpy.typing import NDArray
 
 from benchmarks.model_figures import EXPORTING, Job
-from benchmarks.pair_figures import measure_pair, open_pair
-from benchmarks.random_weights import accept_random_weights, radio_code, write_pair, write_sam2
+from benchmarks.random_weights import accept_random_weights, radio_code, write_sam2, write_trio
 from benchmarks.segmenter_figures import measure_segmenter
+from benchmarks.trio_figures import measure_trio, open_trio
 from fus3dmaps_core.encoders.catalogue import catalogue
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_lab.simulation.room.furnished_room import FurnishedRoom
@@ -32,7 +32,7 @@ REFUSED = 2
 
 
 def main(task: str, job_file: Path, result: Path) -> int:
-    """Prepare or measure a model; returns the exit code."""
+    """Prepare or measure a model, and return the exit code."""
     job = Job(**json.loads(job_file.read_text()))
     torch.set_num_threads(job.threads)
     cv2.setNumThreads(job.threads)
@@ -53,15 +53,15 @@ def _prepare(job: Job) -> dict[str, Any]:
     if job.random:
         folder = Path(job.folder) / "weights"
         folder.mkdir()
-        if job.kind == "pair":
-            weights = write_pair(job.name, folder)
+        if job.kind == "trio":
+            weights = write_trio(job.name, folder)
             code = radio_code() if (folder / "RADIO").exists() else "installed"
         elif job.name == "sam2":
             weights = write_sam2(folder)
-    elif job.kind == "pair":
+    elif job.kind == "trio":
         _check_installed(job)
-    if job.kind == "pair" and job.runtime in EXPORTING:
-        open_pair(Job(**{**asdict(job), "weights": weights}))
+    if job.kind == "trio" and job.runtime in EXPORTING:
+        open_trio(Job(**{**asdict(job), "weights": weights}))
     return {"weights": weights, "code": code}
 
 
@@ -75,13 +75,13 @@ def _check_installed(job: Job) -> None:
 def _measure(job: Job) -> dict[str, Any]:
     rgb, depth_m = view(job.height, job.width)
     before = cpu_seconds()
-    figures = measure_pair(job, rgb) if job.kind == "pair" else measure_segmenter(job, rgb, depth_m)
+    figures = measure_trio(job, rgb) if job.kind == "trio" else measure_segmenter(job, rgb, depth_m)
     all_s, busy_s, own_s = (now - then for now, then in zip(cpu_seconds(), before, strict=True))
     return asdict(figures) | {"busy_with_others": max(0.0, busy_s - own_s) / all_s}
 
 
 def cpu_seconds() -> tuple[float, float, float]:
-    """Return seconds of all cores since the machine's start, the busy ones, and this process's with its children."""
+    """Read the time of all cores since boot, their busy time, and this process's with its children, seconds."""
     ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]]
     idle = ticks[3] + ticks[4]
     per_second = os.sysconf("SC_CLK_TCK")
@@ -89,7 +89,7 @@ def cpu_seconds() -> tuple[float, float, float]:
 
 
 def view(height: int, width: int) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Render a frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
+    """Make a frame of the furnished room at a size in pixels: (H, W, 3) uint8, and (H, W) float32 metres."""
     frame = FurnishedRoom().frame(_VIEW)
     rgb = cv2.resize(frame.rgb, (width, height), interpolation=cv2.INTER_AREA)
     depth_m = cv2.resize(frame.depth_m, (width, height), interpolation=cv2.INTER_NEAREST)

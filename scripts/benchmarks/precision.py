@@ -26,19 +26,19 @@ _TOP = 10
 
 
 def cosine_error(stored: NDArray[np.floating], exact: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Compute 1 - cosine of each row with the exact one, (n,) float64, without that difference's cancellation."""
+    """Compute 1 - cosine of each row with the exact one, without cancellation: (n,) float64."""
     a, b = (values / np.linalg.norm(values, axis=1, keepdims=True) for values in (stored.astype(np.float64), exact))
     return np.asarray(0.5 * ((a - b) ** 2).sum(axis=1))
 
 
 def rank_correlation(first: NDArray[np.floating], second: NDArray[np.floating]) -> float:
-    """Return Spearman's correlation of two scores (n,) of the same things; ties are broken by position."""
+    """Compute Spearman's correlation of two scores (n,) of the same things; ties are broken by position."""
     ranks = [np.argsort(np.argsort(scores, kind="stable")) for scores in (first, second)]
     return float(np.corrcoef(ranks[0], ranks[1])[0, 1])
 
 
 def top_overlap(first: NDArray[np.floating], second: NDArray[np.floating], count: int = _TOP) -> float:
-    """Return the share of the best ``count`` of one score (n,) that are among the best of the other."""
+    """Compute the share of the best ``count`` of one score (n,) that are among the best of the other."""
     best = [set(np.argsort(-scores, kind="stable")[:count].tolist()) for scores in (first, second)]
     return len(best[0] & best[1]) / count
 
@@ -91,13 +91,13 @@ def _params(run: Run, dimension: int, dtype: str, **further: Any) -> dict[str, A
 
 
 def _scores(semantic_map: SemanticMap, text: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the cosine of every voxel with a text, in an order that maps of the same voxels share."""
+    """Compute the cosine of every voxel with a text, in an order that maps of the same voxels share."""
     answer = answer_query(semantic_map, KnownText(text), TextQuery(["anything"], layer="dense"), 100.0)
     return np.asarray(answer.similarity[np.argsort(answer.points_m[:, 0])])
 
 
 def _stored(semantic_map: SemanticMap) -> NDArray[np.float64]:
-    """Return the stored means in the order of their voxels along x, without a row's scale: no cosine depends on it."""
+    """Return stored means in the order of their voxels along x, up to the scale of a row, which no cosine depends on."""
     state = semantic_map.export_state()
     order = np.argsort(state["voxel_coordinates"][state["dense_slot"], 0])
     return np.asarray(state["dense_embedding"][order], np.float64)

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from fus3dmaps_core.encoders.radio.pair import RadioPair
+from fus3dmaps_core.encoders.radio.loading import RadioVariant
 from fus3dmaps_core.encoders.weights import WeightFile
 
 _SEED = 17
@@ -26,19 +26,20 @@ _PUBLISHED_FILES = (
     ("fus3dmaps_core.encoders.siglip2", "TOKENIZER"),
     ("fus3dmaps_core.segmenters.sam2.network", "SAM2"),
 )
-_RADIO_PAIRS = (("fus3dmaps_core.encoders.radio.naradio", "NARADIO"), ("fus3dmaps_core.encoders.radio.radseg", "RADSEG"))
+_RADIO_VARIANTS = (("fus3dmaps_core.encoders.radio.naradio", "NARADIO"), ("fus3dmaps_core.encoders.radio.radseg", "RADSEG"))
 
 
 def accept_random_weights() -> None:
-    """Have pairs and segmenters take files of any content under the published names, in this process."""
+    """Have trios and segmenters take files of any content under the published names, in this process."""
     for module, name in _PUBLISHED_FILES:
         _replace(module, name, _any_content)
-    for module, name in _RADIO_PAIRS:
-        _replace(module, name, _pair_of_any_content)
+    for module, name in _RADIO_VARIANTS:
+        held: Any = import_module(module)
+        held.ENCODER = _variant_of_any_content(getattr(held, name)).definition
 
 
-def write_pair(name: str, folder: Path) -> str:
-    """Write what ``encoder.weights`` may name for a pair.
+def write_trio(name: str, folder: Path) -> str:
+    """Write what ``encoder.weights`` may name for a trio.
 
     Args:
         name: Registry name.
@@ -49,9 +50,9 @@ def write_pair(name: str, folder: Path) -> str:
 
     Raises:
         EncoderError: A package is missing.
-        ValueError: There is nothing to make random weights of this pair.
+        ValueError: There is nothing to make random weights of this trio.
     """
-    write = PAIRS.get(name)
+    write = TRIOS.get(name)
     if write is None:
         raise ValueError(f"no random weights for encoder '{name}': name the folder of its weights by --weights")
     torch.manual_seed(_SEED)
@@ -75,18 +76,18 @@ def write_sam2(folder: Path) -> str:
 
 
 def radio_code() -> str:
-    """Tell whose code builds RADIO's networks beside random weights: its authors' or that of the tests."""
+    """Say whose code builds RADIO's networks for random weights: its authors' or that of the tests."""
     files = _helper("radio_files")
     return "stand-in" if files.find_checkout() == files.STAND_IN else "RADIO's own"
 
 
 def _write_radio(name: str, folder: Path) -> None:
     files = _helper("radio_files")
-    checkout, pair = files.find_checkout(), files.PAIRS[name]
+    checkout, variant = files.find_checkout(), files.VARIANTS[name]
     (folder / "RADIO").symlink_to(checkout.resolve(), target_is_directory=True)
-    path = folder / pair.radio.file_name
+    path = folder / variant.radio.file_name
     files.write_checkpoint(path, checkout, name, _HEAD_WIDTH, _HEAD_LAYERS, _TRANSFORMERS[name])
-    files.write_text(folder, pair)
+    files.write_text(folder, variant)
 
 
 def _write_siglip2(folder: Path) -> None:
@@ -111,14 +112,14 @@ def _helper(name: str) -> Any:
     return import_module(name)
 
 
-PAIRS: dict[str, Callable[[Path], None]] = {
+TRIOS: dict[str, Callable[[Path], None]] = {
     "clip_dinoiser": _write_clip_dinoiser,
     "lite": lambda folder: None,  # pip brings them
     "naradio": partial(_write_radio, "naradio"),
     "radseg": partial(_write_radio, "radseg"),
     "siglip2": _write_siglip2,
 }
-"""What writes random weights of each pair into an empty directory."""
+"""Functions that write random weights of each trio into an empty directory."""
 
 
 def _replace(module: str, name: str, change: Callable[[Any], Any]) -> None:
@@ -130,6 +131,6 @@ def _any_content(file: WeightFile) -> WeightFile:
     return replace(file, sha256="", git_blob="")
 
 
-def _pair_of_any_content(pair: RadioPair) -> RadioPair:
-    text = replace(pair.text, weights=_any_content(pair.text.weights), tokenizer=_any_content(pair.text.tokenizer))
-    return replace(pair, radio=_any_content(pair.radio), text=text)
+def _variant_of_any_content(variant: RadioVariant) -> RadioVariant:
+    text = replace(variant.text, weights=_any_content(variant.text.weights), tokenizer=_any_content(variant.text.tokenizer))
+    return replace(variant, radio=_any_content(variant.radio), text=text)

@@ -1,4 +1,4 @@
-"""What the figures of a run say of each other."""
+"""Ratios between the figures of a run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _SAME_INPUT = ("map_voxels", "d", "points", "keyframes")
 
 
 def ratios(measurements: Sequence[Measurement]) -> list[Measurement]:
-    """Compare largest and smallest map, most and fewest instances, RayFronts and ours, our bandwidth and a plain copy's."""
+    """Compare largest and smallest map, most and fewest instances, RayFronts and ours, and bandwidth and a plain copy's."""
     return [
         *_across(measurements, "dense_update", "map_voxels", ("points", "keyframes")),
         *_across(measurements, "instance_update", "instances", ("map_voxels", "masks")),

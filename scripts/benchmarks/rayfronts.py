@@ -108,7 +108,7 @@ class Peer:
         return xyz, torch.cat((rgb, features, torch.ones((len(xyz), 1), device=self._device)), dim=1)
 
     def update(self, xyz: Tensor, rows: Tensor) -> None:
-        """Add one keyframe."""
+        """Update the map by one keyframe."""
         self.map._tmp_pc_xyz.append(xyz)
         self.map._tmp_pc_rgb_feat_conf.append(rows)
         self.map.accum_semantic_voxels()

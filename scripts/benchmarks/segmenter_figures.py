@@ -36,7 +36,7 @@ class _Size:
         parameters: Its weights.
         frame_gflop: 10^9 operations of a frame.
         frame_input: Shape of its input.
-        precision: Of its weights.
+        precision: Precision of its weights.
     """
 
     parameters: int
@@ -118,7 +118,7 @@ def _size(job: Job, segmenter: Any) -> _Size:
 
 
 def sam2_flops(network: Any, image: torch.Tensor, points: torch.Tensor, per_pass: int) -> int:
-    """Count SAM 2's operations on a frame: the image encoder's, and the decoder's, which every point costs the same.
+    """Count the operations of SAM 2 on a frame: of the image encoder, and of the decoder, which are equal for all points.
 
     Args:
         network: ``Sam2Model``.

@@ -39,7 +39,7 @@ _SPARE_BYTES = 2**31
 
 
 def known_dtypes() -> list[str]:
-    """Return the map's storage types."""
+    """List the map's storage types."""
     return [str(name) for name in get_args(MapConfig.model_fields["dtype"].annotation)]
 
 
@@ -51,7 +51,7 @@ def default_dtype() -> str:
 def measure_all(
     run: Run, sizes: Sequence[int], settings: Sequence[tuple[int, str]], rayfronts: Path | None
 ) -> list[Measurement]:
-    """Measure every case at every setting, the peer's where a checkout is given, and the ratios between all of them.
+    """Measure every case of the map at every setting, the peer's where a checkout is given, and the ratios between them.
 
     Args:
         run: What the cases share.
@@ -107,7 +107,7 @@ def _measure_setting(run: Run, sizes: Sequence[int], dimension: int, dtype: str)
 
 
 def settings(widths: Sequence[int], types: Sequence[str], quick: bool) -> list[tuple[int, str]]:
-    """Return width and storage type of each group of cases."""
+    """List width and storage type of each group of cases."""
     chosen = list(widths) or list(QUICK_DIMENSIONS if quick else DIMENSIONS)
     if types:
         return [(width, dtype) for dtype in types for width in chosen]

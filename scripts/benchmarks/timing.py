@@ -35,7 +35,7 @@ class Times:
 
 
 def spread(samples: Sequence[float]) -> dict[str, float]:
-    """Return smallest sample, quartiles, largest sample and number of samples."""
+    """Return the smallest sample, quartiles, the largest sample and the number of samples."""
     low, first, third, high = np.percentile(samples, (0, 25, 75, 100))
     return {"min": float(low), "q1": float(first), "q3": float(third), "max": float(high), "samples": len(samples)}
 
@@ -110,7 +110,7 @@ def usable_cores() -> int:
 
 
 def copy_bandwidth(repeats: int, device: str = "cpu", size_bytes: int = 2**28) -> tuple[float, dict[str, float]]:
-    """Measure what the memory gives: a plain copy of a large buffer by torch's threads.
+    """Measure the bandwidth of the memory: a plain copy of a large buffer by torch's threads.
 
     Memory of a virtual machine may lie near its processors or behind another one, at half the speed, and what the maps get
     is mixed. So several buffers are held side by side and the fastest counts, or shares of it would depend on luck.

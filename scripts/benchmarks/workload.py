@@ -58,7 +58,7 @@ class World:
     """The same for every map of a run."""
 
     def __init__(self, max_voxels: int, seed: int) -> None:
-        """Build it.
+        """Build the world.
 
         Args:
             max_voxels: Size of the largest map.
@@ -186,6 +186,6 @@ def _first_halves(labels: NDArray[np.int64], count: int) -> NDArray[np.bool_]:
 
 
 def _keys(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return one integer for each voxel of the building, in the order of the indices."""
+    """Make one integer for each voxel of the building, in the order of the indices."""
     shifted = voxels + 2**20
     return (shifted[:, 0] << 42) | (shifted[:, 1] << 21) | shifted[:, 2]

@@ -1,4 +1,4 @@
-"""The card of the pair ``clip_dinoiser`` against its true architecture, and wrong weights with what to get instead."""
+"""The card of the trio ``clip_dinoiser`` against its true architecture, and wrong weights with what to get instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pair on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map."""
+"""The trio on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from pair_maps import map_by_name, map_with_pooled_patches
 from reference.clip_vit import patch_features
 from safetensors.torch import save_file
+from trio_maps import map_by_name, map_with_pooled_patches
 
 from fus3dmaps_core.encoders.clip_dinoiser import make_trio
 from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
@@ -49,7 +49,7 @@ def trio(clip, heads) -> EncoderTrio:
 
 @pytest.fixture(scope="module")
 def directory(clip, heads, tmp_path_factory) -> Path:
-    """Weights of one's own, as `encoder.weights` takes them."""
+    """Write weights of one's own, as `encoder.weights` takes them."""
     folder = tmp_path_factory.mktemp("weights")
     save_file(clip.state_dict(), folder / "open_clip_model.safetensors")
     save_file(heads.state_dict(), folder / "last.safetensors")
@@ -61,7 +61,7 @@ def picture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def normalised(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 as the network takes it: (3, H, W)."""
+    """Normalise an (H, W, 3) uint8 image as the network takes it: (3, H, W)."""
     return ((rgb / 255.0 - MEAN) / STD).transpose(2, 0, 1)
 
 
@@ -122,7 +122,7 @@ def test_the_value_path_is_the_plain_ones(network, rng, size):
 
 
 def plain_heads(features: np.ndarray, weights: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Correlations (patches, patches) and saliency (rows, columns) of (width, rows, columns) features."""
+    """Compute correlations (patches, patches) and saliency (rows, columns) of (width, rows, columns) features."""
     _, rows, columns = features.shape
     padded = np.pad(features, ((0, 0), (1, 1), (1, 1)), mode="edge")
     projected = weights["obj_proj.bias"][:, None, None] + sum(
@@ -233,5 +233,5 @@ def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
     map_with_pooled_patches(trio, monkeypatch)
 
 
-def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
+def test_the_pipeline_maps_with_the_trio_that_one_parameter_names(directory, monkeypatch):
     map_by_name("clip_dinoiser", directory, 512, monkeypatch)

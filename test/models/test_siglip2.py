@@ -1,4 +1,4 @@
-"""The pair on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map.
+"""The trio on its true architecture at full width, with random weights: shapes, spaces, plain numbers, and a whole map.
 
 Only the vocabulary of the text tower is shortened, and most tests use a tower that was "trained" at 64 pixels, whose
 position table is the one thing that differs from the published model's.
@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 import torch
 from open_clip.zero_shot_metadata import SIMPLE_IMAGENET_TEMPLATES
-from pair_maps import map_by_name, map_with_pooled_patches
 from reference.siglip_vit import pooled_alone, tokens
 from safetensors.torch import save_file
 from siglip2_files import published_state, random_model, write_directory, write_tokenizer
 from tokenizers import Tokenizer
+from trio_maps import map_by_name, map_with_pooled_patches
 
 from fus3dmaps_core.encoders import siglip2
-from fus3dmaps_core.encoders.graphs import GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio
 from fus3dmaps_core.encoders.registry import load_text_encoder, load_trio
 from fus3dmaps_core.encoders.siglip2.network import (
@@ -79,7 +79,7 @@ def picture(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
 
 
 def normalised(rgb: np.ndarray) -> np.ndarray:
-    """(H, W, 3) uint8 as the network takes it: (3, H, W)."""
+    """Normalise an (H, W, 3) uint8 image as the network takes it: (3, H, W)."""
     return ((rgb / 255.0 - MEAN) / STD).transpose(2, 0, 1)
 
 
@@ -208,9 +208,7 @@ def test_a_text_is_the_mean_of_the_models_own_embeddings_of_its_templates(trio, 
     np.testing.assert_allclose(trio.text.encode_text(["x", "Red CUP!"])[1], mean / np.linalg.norm(mean), atol=1e-5)
 
 
-def test_bfloat16_stays_close_and_is_for_gpus_alone(tower, trio, rng):
-    assert siglip2.default_dtype("cpu") is torch.float32
-    assert siglip2.default_dtype("cuda:0") is torch.bfloat16
+def test_bfloat16_stays_close(tower, trio, rng):
     rgb = picture(rng, 64, 96)
     half = SiglipTokens(build_vision(SIZE_PX).to_empty(device="cpu"))
     half.vision.load_state_dict(tower.vision.state_dict())
@@ -327,5 +325,5 @@ def test_instances_of_pooled_patches_need_no_crop(trio, monkeypatch):
     map_with_pooled_patches(trio, monkeypatch)
 
 
-def test_the_pipeline_maps_with_the_pair_that_one_parameter_names(directory, monkeypatch):
+def test_the_pipeline_maps_with_the_trio_that_one_parameter_names(directory, monkeypatch):
     map_by_name("siglip2", directory, 768, monkeypatch)

@@ -1,7 +1,7 @@
-"""The paper's pair ``clip_dinoiser``: CLIP's features, pooled where CLIP-DINOiser sees one object; d = 512.
+"""The paper's trio ``clip_dinoiser``: CLIP's features, pooled where CLIP-DINOiser sees one object; d = 512.
 
 CLIP is OpenCLIP's ViT-B/16, trained on LAION-2B (package ``open_clip``, MIT); the heads are those of Wysoczanska et al. 2024
-(Apache-2.0). Which files are needed stands in :mod:`fus3dmaps_core.encoders.clip_dinoiser.published`. ``encoder.weights``
+(Apache-2.0). :mod:`fus3dmaps_core.encoders.clip_dinoiser.published` lists the files that are needed. ``encoder.weights``
 is a directory that holds both, or CLIP's file or repository of the hub; the heads then are the published ones.
 """
 
@@ -14,13 +14,14 @@ from fus3dmaps_core.encoders.clip_dinoiser.heads import DinoiserHeads
 from fus3dmaps_core.encoders.clip_dinoiser.network import MEAN, STD, ClipCrops, ClipDinoiser, load_clip, load_heads
 from fus3dmaps_core.encoders.clip_dinoiser.published import CLIP, HEADS
 from fus3dmaps_core.encoders.clip_dinoiser.text import ClipTextEncoder
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 
 CARD = EncoderCard(
     name="clip_dinoiser",
-    summary="The paper's lighter pair: CLIP ViT-B/16, its patches pooled by DINOiser's heads.",
+    summary="The paper's lighter trio: CLIP ViT-B/16, its patches pooled by DINOiser's heads.",
     dimension=512,
     variance_ratio=5.0,  # [sec: Vision Models]
     patch_px=16,
@@ -29,7 +30,7 @@ CARD = EncoderCard(
     packages=("open_clip", "torchvision", "safetensors"),
 )
 
-_LOGIT_SCALE = 100.0  # Where the factor that CLIP learned is capped, and is.
+_LOGIT_SCALE = 100.0  # The factor that CLIP learned; training caps it here.
 
 
 def load_trio(device: str, crop_padding: float, weights: str) -> EncoderTrio:
@@ -60,7 +61,7 @@ def load_text_encoder(device: str, weights: str) -> TextEncoder:
 
 
 def make_trio(clip: Any, heads: DinoiserHeads, device: str, crop_padding: float) -> EncoderTrio:
-    """The three encoders over given networks.
+    """Make the three encoders from loaded networks.
 
     Args:
         clip: ``open_clip`` CLIP model with an image transformer.
@@ -81,3 +82,6 @@ def make_trio(clip: Any, heads: DinoiserHeads, device: str, crop_padding: float)
         ),
         text=ClipTextEncoder(clip, device),
     )
+
+
+ENCODER = EncoderDefinition(CARD, load_trio, load_text_encoder)

@@ -11,7 +11,7 @@ _EPSILON = 1e-6
 
 
 def guided_pooling(features: torch.Tensor, correlations: torch.Tensor, threshold: float = THRESHOLD) -> torch.Tensor:
-    """Mean of the features of all patches, weighted by how far each correlates with the patch in question.
+    """Replace the features of each patch by a mean over all patches, weighted by their correlation with it.
 
     Args:
         features: (n, d, rows, columns).

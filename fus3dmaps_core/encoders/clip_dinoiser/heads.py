@@ -14,11 +14,11 @@ _KERNEL = 3
 
 
 class DinoiserHeads(nn.Module):
-    """Imitate what DINO and FOUND say of an image, from CLIP's own features.
+    """Two layers that imitate, from CLIP's own features, what DINO and FOUND say of an image.
 
     Attributes:
-        obj_proj: Into a space in which patches of one object are alike, as DINO's are.
-        bkg_decoder: Whether a patch belongs to an object, as FOUND says. Both names are the published file's.
+        obj_proj: Projects into a space in which patches of one object are alike, as DINO's are.
+        bkg_decoder: Tells whether a patch belongs to an object, as FOUND does. Both names are the published file's.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class DinoiserHeads(nn.Module):
         self.bkg_decoder = nn.Conv2d(WIDTH, 1, 1)
 
     def correlations(self, features: torch.Tensor) -> torch.Tensor:
-        """Cosines between the patches of each image.
+        """Compute the cosines between the patches of each image.
 
         Args:
             features: (n, 768, rows, columns).
@@ -40,7 +40,7 @@ class DinoiserHeads(nn.Module):
         return unit.transpose(1, 2) @ unit
 
     def saliency(self, features: torch.Tensor) -> torch.Tensor:
-        """Probability that a patch belongs to an object.
+        """Compute the probability that a patch belongs to an object.
 
         Args:
             features: (n, 768, rows, columns).

@@ -28,7 +28,7 @@ class PatchFeatures(NamedTuple):
 
 
 class MaskClip(nn.Module):
-    """Runs the image transformer of an OpenCLIP model at any size.
+    """The image transformer of an OpenCLIP model, run at any size.
 
     Attributes:
         patch_px: Edge of a patch, pixels.
@@ -41,7 +41,7 @@ class MaskClip(nn.Module):
         self.patch_px = int(visual.patch_size[0])
 
     def forward(self, images: torch.Tensor) -> PatchFeatures:
-        """Features of (n, 3, H, W) normalised images whose sides are multiples of ``patch_px``."""
+        """Compute features of (n, 3, H, W) normalised images whose sides are multiples of ``patch_px``."""
         visual = self.visual
         blocks = list(visual.transformer.resblocks)
         tokens, rows, columns = self._embed(images)
@@ -59,7 +59,7 @@ class MaskClip(nn.Module):
         return PatchFeatures(_as_grid(projected, rows, columns), _as_grid(intermediate, rows, columns))
 
     def positions(self, rows: int, columns: int) -> torch.Tensor:
-        """Position embeddings of the class token and of a grid of patches: (1 + rows * columns, width)."""
+        """Interpolate the position embeddings to a grid of patches, class token first: (1 + rows * columns, width)."""
         embedding = self.visual.positional_embedding
         trained = embedding[1:].T.unflatten(1, tuple(self.visual.grid_size))[None]
         resized = functional.interpolate(trained, (rows, columns), mode="bicubic", align_corners=False)
@@ -74,7 +74,7 @@ class MaskClip(nn.Module):
 
 
 def _values(block: Any, tokens: torch.Tensor) -> torch.Tensor:
-    """What a block's attention would give if each token attended to itself alone."""
+    """Compute what a block's attention would give if each token attended to itself alone."""
     attention = block.attn
     width = attention.embed_dim
     values = functional.linear(
@@ -85,5 +85,5 @@ def _values(block: Any, tokens: torch.Tensor) -> torch.Tensor:
 
 
 def _as_grid(tokens: torch.Tensor, rows: int, columns: int) -> torch.Tensor:
-    """(n, 1 + rows * columns, c) tokens as (n, c, rows, columns), without the class token."""
+    """Reshape (n, 1 + rows * columns, c) tokens to (n, c, rows, columns), without the class token."""
     return tokens[:, 1:].transpose(1, 2).reshape(len(tokens), -1, rows, columns)

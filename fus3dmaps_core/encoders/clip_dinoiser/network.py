@@ -1,4 +1,4 @@
-"""The networks of the pair: built as published, and the one that turns images into patch embeddings."""
+"""The networks of the trio: built as published, and the one that turns images into patch embeddings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.weights import find_weights, fit, only_directory, read_state, saying_what_to_get
 
 MEAN = (0.48145466, 0.4578275, 0.40821073)
-"""Of red, green and blue in [0, 1], which CLIP's images are normalised with."""
+"""Mean of red, green and blue in [0, 1], with which CLIP's images are normalised."""
 STD = (0.26862954, 0.26130258, 0.27577711)
 
 _PARAMETER = "encoder.weights"
@@ -64,7 +64,7 @@ class ClipCrops(nn.Module):
 
 
 def build_clip() -> Any:
-    """The CLIP model of the pair with random weights, on the CPU.
+    """Build the CLIP model of the trio with random weights, on the CPU.
 
     Raises:
         EncoderError: The package ``open_clip`` is missing.
@@ -75,7 +75,7 @@ def build_clip() -> Any:
 
 
 def load_clip(weights: str) -> Any:
-    """The CLIP model with its published weights, or those that ``encoder.weights`` says, on the CPU.
+    """Load the CLIP model onto the CPU, with its published weights or those that ``encoder.weights`` names.
 
     Raises:
         EncoderError: A package or the weights are missing, damaged, or another architecture's.
@@ -88,7 +88,7 @@ def load_clip(weights: str) -> Any:
 
 
 def load_heads(weights: str) -> DinoiserHeads:
-    """The heads with their published weights, or those in the directory that ``encoder.weights`` says, on the CPU.
+    """Load the heads onto the CPU, with their published weights or those in the directory that ``encoder.weights`` names.
 
     Raises:
         EncoderError: The weights are missing, damaged, or another architecture's.

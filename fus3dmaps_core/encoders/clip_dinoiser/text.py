@@ -16,10 +16,10 @@ _BATCH = 80  # Sentences of a pass; a prompt has as many templates.
 
 
 class ClipTextEncoder:
-    """Embeds prompts with CLIP-DINOiser's templates: 80 sentences each, whose unit embeddings are averaged.
+    """CLIP's text encoder with CLIP-DINOiser's templates: a prompt is 80 sentences, whose unit embeddings are averaged.
 
     Attributes:
-        space: Name of the pair.
+        space: Name of the trio.
     """
 
     space = "clip_dinoiser"
@@ -46,7 +46,7 @@ class ClipTextEncoder:
         return rows
 
     def _embed(self, sentences: list[str]) -> NDArray[np.float32]:
-        """Unit mean of the unit embeddings of some sentences: (512,)."""
+        """Average the unit embeddings of some sentences and normalise the mean: (512,)."""
         with torch.inference_mode():
             tokens = self._tokenizer(sentences).to(self._device)
             parts = [functional.normalize(self._sentences(batch), dim=1) for batch in torch.split(tokens, _BATCH)]
@@ -54,7 +54,7 @@ class ClipTextEncoder:
         return mean
 
     def _sentences(self, tokens: torch.Tensor) -> torch.Tensor:
-        """CLIP's embeddings of (n, context) tokens: (n, 512).
+        """Embed (n, context) tokens with CLIP: (n, 512).
 
         No token attends to later ones and the end token is what counts, so the positions after the longest sentence are
         left out: the numbers are the same in a fifth of the time.

@@ -1,31 +1,32 @@
 """The default encoder trio ``lite``: small networks that pip alone brings, for any CPU.
 
 This is ConSE (Norouzi et al. 2013, "Zero-Shot Learning by Convex Combination of Semantic Embeddings"): an ImageNet
-classifier (EfficientNet-Lite0) and a COCO detector (SSD-MobileNet-v2) say which class names a piece of image goes by, and a
+classifier (EfficientNet-Lite0) and a COCO detector (SSD-MobileNet-v2) say which class names fit a piece of an image, and a
 small sentence model (all-MiniLM-L6-v2) embeds these names and the prompts in one space. Its visual vocabulary is bounded by
 those 1000 + 80 names: a prompt is answered through the names nearest to it in meaning. **It is not CLIP**, nor any other
 network trained on images and text together, and what it scores says nothing about the vision-language models of the paper.
 
-Origin and licence of the weights stand in :mod:`fus3dmaps_core.encoders.lite.weights`. Nothing is ever downloaded.
+:mod:`fus3dmaps_core.encoders.lite.packaged_files` names origin and licence of the weights. Nothing is ever downloaded.
 """
 
 from __future__ import annotations
 
 from fus3dmaps_core.encoders.cards import EncoderCard, ShippedFile
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.encoders.lite.crop import LiteCropEncoder
 from fus3dmaps_core.encoders.lite.detector import shared_detector
 from fus3dmaps_core.encoders.lite.network import load_classifier
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER, DETECTOR_GRAPH, TEXT_MODEL, PackagedFile
 from fus3dmaps_core.encoders.lite.patch import LitePatchEncoder
 from fus3dmaps_core.encoders.lite.space import DIMENSION, ConceptSpace, LiteTextEncoder
 from fus3dmaps_core.encoders.lite.text import SentenceModel
 from fus3dmaps_core.encoders.lite.vocabulary import load_vocabulary
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER, DETECTOR_GRAPH, TEXT_MODEL, WeightFile
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.errors import EncoderError
 
 
-def _shipped(title: str, file: WeightFile) -> ShippedFile:
+def _shipped(title: str, file: PackagedFile) -> ShippedFile:
     return ShippedFile(title, file.package, file.version, file.path, "Apache-2.0")
 
 
@@ -99,3 +100,6 @@ def _check_no_weights(weights: str) -> None:
         raise EncoderError(
             f"parameter 'encoder.weights': encoder 'lite' has no weights but those of its pip packages, got '{weights}'"
         )
+
+
+ENCODER = EncoderDefinition(CARD, load_trio, load_text_encoder)

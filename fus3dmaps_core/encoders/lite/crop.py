@@ -9,20 +9,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import crop_evidence
 from fus3dmaps_core.encoders.lite.network import CLASSES, MEAN, EfficientNetLite0
 from fus3dmaps_core.encoders.lite.space import ConceptSpace
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.masks import Masks
 
-# The network was trained at 224 pixels; most crops are smaller than this, and finds are as good in half the time.
+# The network was trained at 224 pixels; most crops are smaller than this, and results are as good in half the time.
 _SIZE_PX = 160
 _BATCH = 8  # Larger batches fall out of a small machine's cache and are slower.
 
 
 class LiteCropEncoder:
-    """Embeds the objects behind masks, in batches."""
+    """The crop encoder of ``lite``: it embeds the objects behind masks, in batches."""
 
     def __init__(
         self, network: EfficientNetLite0, detector: Detector, space: ConceptSpace, padding: float, device: str
@@ -45,11 +45,11 @@ class LiteCropEncoder:
             return self._space.embed(logits, evidence)
 
     def graph(self, height: int, width: int) -> Graph:
-        """The classifier for a batch of crops, whose size is that of no image; no detector is in it."""
+        """Describe the classifier for a batch of crops, whatever the image's size; the detector is not part of it."""
         return Graph("crop", self._network, (_BATCH, 3, _SIZE_PX, _SIZE_PX), ("logits",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network
 
     def _crop(self, rgb: NDArray[np.uint8], mask: NDArray[np.bool_], box: NDArray[np.int32]) -> NDArray[np.uint8]:
@@ -57,7 +57,7 @@ class LiteCropEncoder:
         x0, y0, x1, y1 = (int(value) for value in box)
         pad_x, pad_y = int(self._padding * (x1 - x0)), int(self._padding * (y1 - y0))
         window = np.s_[max(0, y0 - pad_y) : min(height, y1 + pad_y), max(0, x0 - pad_x) : min(width, x1 + pad_x)]
-        # The neighbours of an object would vote for themselves: outside the mask stands what the network reads as zero.
+        # An object's neighbours would be classified as well: outside the mask is what the network reads as zero.
         crop = np.where(mask[window][..., None], rgb[window], np.uint8(MEAN))
         shrinks = max(crop.shape[:2]) > _SIZE_PX
         interpolation = cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR

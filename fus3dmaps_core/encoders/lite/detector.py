@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.lite.weights import DETECTOR_GRAPH, DETECTOR_LAYOUT
+from fus3dmaps_core.encoders.lite.packaged_files import DETECTOR_GRAPH, DETECTOR_LAYOUT
 
 _INPUT_SIZE = 300
 _MIN_SCORE = 0.1
@@ -38,12 +38,12 @@ class Detections:
     boxes: NDArray[np.float32]
 
     def __len__(self) -> int:
-        """Number of detections."""
+        """Return the number of detections."""
         return len(self.labels)
 
 
 class Detector:
-    """The network and its last answers. Safe to use from several threads."""
+    """The network and its last answers; safe to use from several threads."""
 
     def __init__(self) -> None:
         """Load the network.
@@ -56,7 +56,7 @@ class Detector:
         self._lock = threading.Lock()
 
     def detect(self, rgb: NDArray[np.uint8]) -> Detections:
-        """Detections of an (H, W, 3) uint8 image."""
+        """Detect things in an (H, W, 3) uint8 image."""
         key = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16, salt=str(rgb.shape[:2]).encode()).digest()
         with self._lock:
             found = self._answers.get(key)
@@ -90,7 +90,7 @@ def _load() -> Detector:
 
 
 def shared_detector() -> Detector:
-    """The detector of this process, loaded on first use.
+    """Return the detector of this process, loaded on first use.
 
     Raises:
         EncoderError: The weights' package is missing or altered.

@@ -14,7 +14,7 @@ _SOFT_MARGIN = 0.3
 
 
 def crop_evidence(detections: Detections, boxes: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Evidence for crops: a detection speaks of a box the more, the better the two coincide.
+    """Compute evidence for crops: the better a detection and a box coincide, the more it counts.
 
     Args:
         detections: Detections of the image.
@@ -33,7 +33,7 @@ def crop_evidence(detections: Detections, boxes: NDArray[np.int32]) -> NDArray[n
 
 
 def patch_evidence(detections: Detections, rows: int, columns: int, patch_px: int) -> NDArray[np.float32]:
-    """Evidence for patches: a detection speaks of the patches inside its box, less and less towards the border.
+    """Compute evidence for patches: a detection counts for the patches inside its box, less towards the border.
 
     Where boxes of different categories overlap, the smaller takes precedence: a cup on a table is not a table.
 
@@ -63,7 +63,7 @@ def patch_evidence(detections: Detections, rows: int, columns: int, patch_px: in
 
 
 def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Intersection over union of n and m boxes (x0, y0, x1, y1) with positive sides: (n, m) float32."""
+    """Compute the intersection over union of n and m boxes (x0, y0, x1, y1) with positive sides: (n, m) float32."""
     low = np.maximum(first[:, None, :2], second[None, :, :2])
     high = np.minimum(first[:, None, 2:], second[None, :, 2:])
     shared = np.clip(high - low, 0, None).prod(axis=2)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER
 
 FEATURE_STRIDE = 32
 FEATURE_WIDTH = 1280
@@ -98,7 +98,7 @@ class EfficientNetLite0(nn.Module):
         self._fc = nn.Linear(FEATURE_WIDTH, CLASSES)
 
     def fold_normalisation(self) -> None:
-        """Fold the batch normalisations into the convolutions before them, which inference does not tell apart."""
+        """Fold the batch normalisations into the convolutions before them, which changes nothing in inference."""
         _fold(self, "_conv_stem", "_bn0")
         _fold(self, "_conv_head", "_bn1")
         for block in self._blocks:
@@ -108,23 +108,23 @@ class EfficientNetLite0(nn.Module):
             _fold(block, "_project_conv", "_bn2")
 
     def features(self, rgb: Tensor) -> Tensor:
-        """Final feature map, (n, 1280, ceil(H / 32), ceil(W / 32))."""
+        """Compute the final feature map, (n, 1280, ceil(H / 32), ceil(W / 32))."""
         x = functional.relu6(self._bn0(self._conv_stem((rgb - MEAN) / _STD)))
         for block in self._blocks:
             x = block(x)
         return functional.relu6(self._bn1(self._conv_head(x)))
 
     def logits(self, features: Tensor) -> Tensor:
-        """Class logits (..., 1000) of pooled or local features (..., 1280)."""
+        """Compute class logits (..., 1000) of pooled or local features (..., 1280)."""
         return functional.linear(features, self._fc.weight, self._fc.bias)
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Class logits (n, 1000) of whole images."""
+        """Compute class logits (n, 1000) of whole images."""
         return self.logits(self.features(rgb).mean(dim=(2, 3)))
 
 
 class PatchLogits(nn.Module):
-    """Class logits of every patch: the classifier on each cell of the pooled feature map, brought to a finer grid."""
+    """Class logits of every patch: the classifier on each cell of the pooled feature map, interpolated to a finer grid."""
 
     def __init__(self, network: EfficientNetLite0, upsampling: int) -> None:
         """Share the classifier.
@@ -137,7 +137,7 @@ class PatchLogits(nn.Module):
         self.network, self._upsampling = network, upsampling
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Logits (n, rows, columns, 1000) of images as :class:`EfficientNetLite0` takes them."""
+        """Compute logits (n, rows, columns, 1000) of images as :class:`EfficientNetLite0` takes them."""
         features = functional.avg_pool2d(self.network.features(rgb), _POOLING, 1, _POOLING // 2, count_include_pad=False)
         logits = self.network.logits(features.permute(0, 2, 3, 1)).permute(0, 3, 1, 2)
         # The classifier is linear and the weights of the interpolation sum to one: logits of the interpolated features.
@@ -151,7 +151,7 @@ def _fold(module: nn.Module, conv: str, norm: str) -> None:
 
 
 def load_classifier(device: str) -> EfficientNetLite0:
-    """The network with its ImageNet weights, in inference mode.
+    """Load the network with its ImageNet weights, in inference mode.
 
     Raises:
         EncoderError: The weights' package is missing or altered.

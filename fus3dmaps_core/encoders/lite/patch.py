@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Graph, Network
 from fus3dmaps_core.encoders.lite.detector import Detector
 from fus3dmaps_core.encoders.lite.evidence import patch_evidence
 from fus3dmaps_core.encoders.lite.network import FEATURE_STRIDE, EfficientNetLite0, PatchLogits
 from fus3dmaps_core.encoders.lite.space import ConceptSpace
+from fus3dmaps_core.encoders.network_graphs import Graph, Network
 from fus3dmaps_core.encoders.protocols import PatchEmbeddings
 
 _UPSAMPLING = 2  # 16-pixel patches from a feature map of stride 32.
@@ -21,7 +21,7 @@ _PATCH_PX = FEATURE_STRIDE // _UPSAMPLING
 
 
 class LitePatchEncoder:
-    """Embeds 16-pixel patches in one pass of the network."""
+    """The patch encoder of ``lite``: it embeds 16-pixel patches in one pass of the network."""
 
     def __init__(self, network: EfficientNetLite0, detector: Detector, space: ConceptSpace, device: str) -> None:
         """Keep the shared models."""
@@ -30,7 +30,7 @@ class LitePatchEncoder:
         self._run: Network = self._network
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns of the patch grid; patches are 16 pixels where the image's sides are multiples of 32."""
+        """Return rows and columns of the patch grid; patches are 16 pixels where the image's sides are multiples of 32."""
         return _UPSAMPLING * -(-height // FEATURE_STRIDE), _UPSAMPLING * -(-width // FEATURE_STRIDE)
 
     def encode_patches(self, rgb: NDArray[np.uint8]) -> PatchEmbeddings:
@@ -47,10 +47,10 @@ class LitePatchEncoder:
         return PatchEmbeddings(embeddings.reshape(rows, columns, -1), np.ones((rows, columns), np.float32))
 
     def graph(self, height: int, width: int) -> Graph:
-        """The classifier on the patches at the size that an image of this one is stretched to; no detector is in it."""
+        """Describe the classifier at the size that such an image is stretched to; the detector is not part of it."""
         rows, columns = self.grid(height, width)
         return Graph("patch", self._network, (1, 3, rows * _PATCH_PX, columns * _PATCH_PX), ("logits",))
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.graphs.GraphEncoder`."""
+        """Run this in place of the torch network, see :class:`fus3dmaps_core.encoders.network_graphs.GraphEncoder`."""
         self._run = network

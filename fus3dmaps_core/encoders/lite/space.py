@@ -29,7 +29,7 @@ _TOP_CLASSES = 50
 
 
 class ConceptSpace:
-    """Turns beliefs about pixels into embeddings. Immutable, so safe to use from several threads."""
+    """The space of ``lite``, which turns class scores into embeddings. Immutable, so safe to use from several threads."""
 
     def __init__(self, vocabulary: Vocabulary, device: str) -> None:
         """Put the vocabulary on the device of the classifier."""
@@ -58,7 +58,7 @@ class ConceptSpace:
 
 
 class LiteTextEncoder:
-    """Embeds prompts into the shared space. Safe to use from several threads.
+    """The text encoder of ``lite``, for prompts in the shared space. Safe to use from several threads.
 
     Attributes:
         space: Name of the trio.

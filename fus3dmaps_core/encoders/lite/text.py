@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.lite.weights import EXTRA, TEXT_CONFIG, TEXT_MODEL, TOKENIZER
+from fus3dmaps_core.encoders.lite.packaged_files import EXTRA, TEXT_CONFIG, TEXT_MODEL, TOKENIZER
 from fus3dmaps_core.errors import EncoderError
 
 WIDTH = 384
@@ -17,7 +17,7 @@ _BATCH = 64
 
 
 class SentenceModel:
-    """Unit embeddings of sentences. Safe to use from several threads."""
+    """A model of unit embeddings of sentences. Safe to use from several threads."""
 
     def __init__(self, device: str) -> None:
         """Load the model from the files of its pip package, never from a network.

@@ -1,8 +1,8 @@
 """The words that pixels are turned into: names of ImageNet and COCO classes, as text embeddings.
 
 Embedding two thousand short sentences takes half a minute on a small machine, so the result is kept in the user's cache
-directory under a key made of the text model, the words and the recipe. A cache that cannot be read is computed anew, one
-that cannot be written is done without.
+directory under a key made of the text model, the words and the recipe. Where the cache cannot be read it is computed anew;
+where it cannot be written nothing is kept.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from fus3dmaps_core.encoders.lite.packaged_files import IMAGENET_NAMES, TEXT_MODEL, TOKENIZER
 from fus3dmaps_core.encoders.lite.text import WIDTH, SentenceModel
-from fus3dmaps_core.encoders.lite.weights import IMAGENET_NAMES, TEXT_MODEL, TOKENIZER
 
 COCO_CATEGORIES = 91
 """Category ids run from 1 to 90."""
@@ -67,7 +67,7 @@ class Vocabulary:
 
 
 def possible_classes() -> NDArray[np.bool_]:
-    """(1000,) bool: the ImageNet classes that may be seen in a room."""
+    """Mark the ImageNet classes that may be seen in a room: (1000,) bool."""
     possible = np.ones(1000, bool)
     possible[list(_LIVING)] = False
     possible[list(_PETS)] = True
@@ -76,13 +76,13 @@ def possible_classes() -> NDArray[np.bool_]:
 
 
 def embed_in_forms(model: SentenceModel, phrases: Sequence[str]) -> NDArray[np.float32]:
-    """Unit mean of a phrase's embeddings in every prompt form: (n, 384) float32."""
+    """Embed n phrases as the unit mean over all prompt forms: (n, 384) float32."""
     sentences = [form.format(phrase) for phrase in phrases for form in _FORMS]
     return _unit(model.embed(sentences).reshape(-1, len(_FORMS), WIDTH).mean(axis=1))
 
 
 def load_vocabulary(model: SentenceModel) -> Vocabulary:
-    """The vocabulary, from the cache where that holds it.
+    """Load the vocabulary from the cache, or compute it and keep it there.
 
     Raises:
         EncoderError: The file of class names is missing or altered.

@@ -21,7 +21,7 @@ from fus3dmaps_core.errors import EncoderError
 
 
 class SummaryHead(nn.Module):
-    """A teacher's head.
+    """The head that imitates a teacher's image embedding.
 
     Attributes:
         token: Place of the summary token that it was trained on.
@@ -29,7 +29,7 @@ class SummaryHead(nn.Module):
     """
 
     def __init__(self, mlp: Any, token: int, dimension: int) -> None:
-        """Keep the network that does it."""
+        """Keep the network."""
         super().__init__()
         self._mlp, self.token, self.dimension = mlp, token, dimension
 
@@ -45,7 +45,7 @@ class SummaryHead(nn.Module):
 
 
 class PatchNetwork(nn.Module):
-    """Normalised images (n, 3, H, W) to patch embeddings (n, rows, columns, d) float32 of unit length."""
+    """The network from normalised images (n, 3, H, W) to patch embeddings (n, rows, columns, d) float32 of unit length."""
 
     def __init__(self, backbone: RadioBackbone, head: SummaryHead) -> None:
         """Join the two; both may be shared."""
@@ -58,7 +58,7 @@ class PatchNetwork(nn.Module):
 
 
 class CropNetwork(nn.Module):
-    """Normalised images (n, 3, H, W) to embeddings (n, d) float32 of unit length, one for each whole image."""
+    """The network from normalised images (n, 3, H, W) to embeddings (n, d) float32 of unit length, one for each image."""
 
     def __init__(self, backbone: RadioBackbone, head: SummaryHead) -> None:
         """Join the two; both may be shared."""
@@ -71,13 +71,13 @@ class CropNetwork(nn.Module):
 
 
 def load_head(checkpoint: Checkpoint, name: str, checkout: Path, encoder: str) -> SummaryHead:
-    """The head of a teacher with the checkpoint's weights, on the CPU.
+    """Load the head of a teacher with the checkpoint's weights onto the CPU.
 
     Args:
-        checkpoint: Read before.
+        checkpoint: The checkpoint that the head is in.
         name: Name of the teacher.
         checkout: RADIO's code.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The checkpoint has no such teacher, or its head is not as it should be.

@@ -21,12 +21,12 @@ with tokens, rows and columns of the patch grid."""
 
 
 class RadioBackbone(nn.Module):
-    """Tokens of normalised images.
+    """RADIO's transformer, which turns normalised images into tokens.
 
     Attributes:
         patch_px: Edge of a patch, pixels; both sides of an image must be multiples of it.
         width: Length of a token.
-        mean: Of red, green and blue in [0, 1], which an image is normalised with, once and outside of this module: what
+        mean: Mean of red, green and blue in [0, 1], which an image is normalised with, once and outside of this module: what
             RADIO's input conditioner holds, which is therefore not run.
         std: Their deviation, likewise.
     """
@@ -56,7 +56,7 @@ class RadioBackbone(nn.Module):
         self.std = _colour(radio.input_conditioner.norm_std)
 
     def patches(self, images: torch.Tensor) -> torch.Tensor:
-        """Features of all patches.
+        """Compute the features of all patches.
 
         Args:
             images: (n, 3, H, W) float, normalised with ``mean`` and ``std``.
@@ -73,7 +73,7 @@ class RadioBackbone(nn.Module):
         return cast(torch.Tensor, features.reshape(len(images), rows, columns, self.width))
 
     def summary(self, images: torch.Tensor, token: int) -> torch.Tensor:
-        """One of the tokens before the patches, which speak for the whole image.
+        """Compute one of the tokens before the patches, which describe the whole image.
 
         Args:
             images: As for :meth:`patches`.

@@ -1,6 +1,6 @@
 """RADIO's own code, which describes its networks: a checkout of the user's, or the pinned revision through ``torch.hub``.
 
-Its licence does not let this package bring the code along.
+Its licence does not allow this package to contain the code.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ _import_lock = threading.Lock()
 
 
 def cached_checkout() -> Path:
-    """Where the pinned revision lies, or may be put, in the cache of ``torch.hub``."""
+    """Return where the pinned revision lies, or may be put, in the cache of ``torch.hub``."""
     return Path(torch.hub.get_dir()) / f"{REPOSITORY.replace('/', '_')}_{REVISION}"
 
 
 def locate_checkout(weights: str) -> Path | None:
-    """Directory of RADIO's code without any download: see :func:`find_checkout`; None where it is not on this machine."""
+    """Find RADIO's code as :func:`find_checkout`, without a download; None where it is not on this machine."""
     directory = local_path(weights)
     candidates = (*((directory / _FOLDER,) if directory else ()), cached_checkout())
     return next((path for path in candidates if (path / "hubconf.py").is_file()), None)
 
 
 def find_checkout(weights: str, encoder: str) -> Path:
-    """Directory of RADIO's code.
+    """Find the directory of RADIO's code, and fetch it if necessary.
 
     Args:
         weights: ``encoder.weights``. Where it is a directory with a folder ``RADIO``, that is the checkout; otherwise the
             pinned revision is taken from the cache of ``torch.hub``, or fetched into it.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: A package is missing, or there is no checkout and none can be fetched; the message says what to
@@ -77,7 +77,7 @@ def import_from(checkout: Path, name: str, encoder: str) -> ModuleType:
     Args:
         checkout: Directory as of :func:`find_checkout`.
         name: Dotted name of the module below the checkout.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: It cannot be imported, or another checkout or package of the same name was imported before.

@@ -47,7 +47,7 @@ def read_checkpoint(path: Path, checkout: Path, encoder: str) -> Checkpoint:
     Args:
         path: A checkpoint as RADIO's authors publish them.
         checkout: RADIO's code, see :mod:`fus3dmaps_core.encoders.radio.checkout`.
-        encoder: Name of the pair, for messages.
+        encoder: Name of the trio, for messages.
 
     Raises:
         EncoderError: The file is damaged, holds Python objects, is no RADIO checkpoint, or lacks weights.
@@ -77,7 +77,7 @@ def read_checkpoint(path: Path, checkout: Path, encoder: str) -> Checkpoint:
 
 
 def _has(state: Mapping[str, torch.Tensor], name: str) -> bool:
-    """Whether a weight is there, as it is or as the product that it was trained as."""
+    """Tell whether a weight is there, as it is or as the product that it was trained as."""
     parent, _, leaf = name.rpartition(".")
     return name in state or any(key.startswith(f"{parent}.parametrizations.{leaf}.") for key in state)
 

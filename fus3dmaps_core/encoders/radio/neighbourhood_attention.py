@@ -69,7 +69,7 @@ class NeighbourhoodAttention(nn.Module):
 
 
 def gaussian_window(rows: int, columns: int, prefix_tokens: int, sigma_patches: float) -> torch.Tensor:
-    """exp(-r^2 / 2 sigma^2) between any two patches at distance r on the grid; rows and columns of prefix tokens are 0.
+    """Compute exp(-r^2 / 2 sigma^2) between any two patches at distance r on the grid; 0 for prefix tokens.
 
     Args:
         rows: Rows of the patch grid.

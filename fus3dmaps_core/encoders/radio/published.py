@@ -1,4 +1,4 @@
-"""Which code and weights the RADIO pairs need, where they are published, and under which licences."""
+"""The code and weights that the trios on RADIO need: where they are published, and under which licences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RADSeg's self-correlating recursive attention: what the last block's attention finds says where it should have looked.
+"""RADSeg's self-correlating recursive attention: the output of the last block's attention decides where a second one looks.
 
 The attention of the block is run as trained. Its output, after the output projection, is cut into as many parts as there
 are heads; the cosines between two tokens' parts, times a scale, are the logits of a second attention over the same values,

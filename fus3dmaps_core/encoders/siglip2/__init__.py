@@ -1,9 +1,9 @@
-"""The small pair ``siglip2``: SigLIP 2 B/16 alone, whose pooling head also takes each patch by itself; d = 768.
+"""The small trio ``siglip2``: SigLIP 2 B/16 alone, whose pooling head also takes each patch by itself; d = 768.
 
-It is the pair for Jetson Orin Nano: one transformer of 93 million parameters embeds patches and crops, weights and code are
-Apache-2.0 (Tschannen et al. 2025). Which files are needed stands in
-:mod:`fus3dmaps_core.encoders.siglip2.published`. ``encoder.weights`` is a directory that holds both, or the model's file or
-repository of the hub; the tokenizer then is the published one, which all of SigLIP 2's models have.
+It is the trio for Jetson Orin Nano: one transformer of 93 million parameters embeds patches and crops, weights and code are
+Apache-2.0 (Tschannen et al. 2025). :mod:`fus3dmaps_core.encoders.siglip2.published` lists the files that are needed.
+``encoder.weights`` is a directory that holds both, or the model's file or repository of the hub; the tokenizer then is the
+published one, which all of SigLIP 2's models have.
 
 The published model was trained on images of 384 pixels, 24x24 patches. Its positions are stretched to the 30x40 of a frame
 of 480x640, and a crop costs half as much as with the model for 512 pixels, for half a point less of zero-shot accuracy on
@@ -18,7 +18,8 @@ from pathlib import Path
 import torch
 
 from fus3dmaps_core.encoders.cards import EncoderCard
-from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.definition import EncoderDefinition
+from fus3dmaps_core.encoders.devices import check_device, default_dtype
 from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
 from fus3dmaps_core.encoders.optional_packages import import_optional
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
@@ -38,9 +39,9 @@ from fus3dmaps_core.encoders.weights import find_weights, only_directory, saying
 
 CARD = EncoderCard(
     name="siglip2",
-    summary="The small pair: SigLIP 2 B/16, its pooling head applied to each patch, for Jetson Orin Nano.",
+    summary="The small trio: SigLIP 2 B/16, its pooling head applied to each patch, for Jetson Orin Nano.",
     dimension=WIDTH,
-    variance_ratio=1.0,  # Not known; that of the other pairs whose patches go through the head of whole images.
+    variance_ratio=1.0,  # Not known; that of the other trios whose patches go through the head of whole images.
     patch_px=PATCH_PX,
     code_licence="",
     files=(MODEL, TOKENIZER),
@@ -86,7 +87,7 @@ def load_text_encoder(device: str, weights: str) -> TextEncoder:
 def make_trio(
     tokens: SiglipTokens, text: TextEncoder, device: str, crop_padding: float, dtype: torch.dtype = torch.float32
 ) -> EncoderTrio:
-    """The three encoders over given networks.
+    """Make the three encoders from loaded networks.
 
     Args:
         tokens: Image tower.
@@ -107,14 +108,12 @@ def make_trio(
     )
 
 
-def default_dtype(device: str) -> torch.dtype:
-    """bfloat16 on CUDA, in which SigLIP 2 was trained, and float32 elsewhere, where it is the faster one."""
-    return torch.bfloat16 if torch.device(device).type == "cuda" else torch.float32
-
-
 def _find_files(weights: str) -> tuple[Path, Path]:
-    """Paths of the model and of the tokenizer."""
+    """Find the files of the model and of the tokenizer."""
     for package in CARD.packages:  # Before gigabytes are fetched.
         import_optional(package, CARD.name)
     model = find_weights(_PARAMETER, weights, MODEL)
     return model, find_weights(_PARAMETER, only_directory(weights), TOKENIZER)  # Anything else is the model's.
+
+
+ENCODER = EncoderDefinition(CARD, load_trio, load_text_encoder)

@@ -16,7 +16,7 @@ from fus3dmaps_core.encoders.weights import fit
 from fus3dmaps_core.errors import EncoderError
 
 MEAN = STD = (0.5, 0.5, 0.5)
-"""Of red, green and blue in [0, 1], which SigLIP's images are normalised with."""
+"""Mean and deviation of red, green and blue in [0, 1], with which SigLIP's images are normalised."""
 
 PATCH_PX = 16
 WIDTH = 768
@@ -43,7 +43,7 @@ class SiglipTokens(nn.Module):
         self.size_px = int(vision.config.image_size)
 
     def forward(self, images: torch.Tensor) -> torch.Tensor:
-        """Tokens of (n, 3, H, W) normalised images, whose sides are multiples of a patch's: (n, rows * columns, width).
+        """Turn (n, 3, H, W) normalised images, with sides of whole patches, into (n, rows * columns, width) tokens.
 
         Where the grid is not the trained one the positions are interpolated to it.
         """
@@ -53,7 +53,7 @@ class SiglipTokens(nn.Module):
 
 
 class PatchNetwork(nn.Module):
-    """Normalised images (n, 3, H, W) to patch embeddings (n, rows, columns, d) float32 of unit length.
+    """The network from normalised images (n, 3, H, W) to patch embeddings (n, rows, columns, d) float32 of unit length.
 
     SigLIP has no class token: a learned probe attends to all tokens, and what it gathers is the image's embedding after a
     residual MLP. Here it attends, for each patch, to the token of this patch alone. The softmax over one token is 1
@@ -76,7 +76,7 @@ class PatchNetwork(nn.Module):
 
 
 class CropNetwork(nn.Module):
-    """Normalised images (n, 3, H, W) to embeddings (n, d) float32 of unit length, one for each whole image."""
+    """The network from normalised images (n, 3, H, W) to embeddings (n, d) float32 of unit length, one for each image."""
 
     def __init__(self, tokens: SiglipTokens) -> None:
         """Share a tower."""
@@ -89,7 +89,7 @@ class CropNetwork(nn.Module):
 
 
 def token_embeddings(head: Any, tokens: torch.Tensor) -> torch.Tensor:
-    """What the pooling head makes of each token if it is the only one.
+    """Apply the pooling head to each token as if it were the only one.
 
     Args:
         head: ``SiglipMultiheadAttentionPoolingHead`` of ``transformers``.
@@ -106,7 +106,7 @@ def token_embeddings(head: Any, tokens: torch.Tensor) -> torch.Tensor:
 
 
 def build_vision(size_px: int) -> Any:
-    """The image tower without memory for its weights: on torch's device ``meta``.
+    """Build the image tower without memory for its weights, on torch's device ``meta``.
 
     Args:
         size_px: Edge of the square images that it is trained on.
@@ -129,7 +129,7 @@ def build_vision(size_px: int) -> Any:
 
 
 def read_vision(path: Path) -> SiglipTokens:
-    """The image tower with the weights of a file, on the CPU in float32.
+    """Load the image tower with the weights of a file, on the CPU in float32.
 
     Args:
         path: File of the whole model. Its positions say which size it was trained on: all of SigLIP 2's B/16

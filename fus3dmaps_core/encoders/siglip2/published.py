@@ -1,4 +1,4 @@
-"""Which files of weights this pair needs, where they are published, and under which licence."""
+"""The files of weights that this trio needs: where they are published, and under which licence."""
 
 from __future__ import annotations
 

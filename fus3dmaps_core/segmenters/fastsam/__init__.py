@@ -19,9 +19,9 @@ import torch
 from fus3dmaps_core.config.schema import EncoderConfig, Precision
 from fus3dmaps_core.encoders.devices import check_device
 from fus3dmaps_core.runtimes.example_images import pictures
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.foreign_graphs import in_precision
 from fus3dmaps_core.runtimes.graph_files import graph_directory
-from fus3dmaps_core.runtimes.opening import open_network
 from fus3dmaps_core.runtimes.tensorrt_network import check_cuda
 from fus3dmaps_core.segmenters.fastsam.contract import input_shape
 from fus3dmaps_core.segmenters.fastsam.published import find_network

@@ -1,4 +1,4 @@
-"""What an exported network must take and give to be FastSAM's, checked in its file before anything runs it."""
+"""The inputs and outputs that FastSAM's exported network must have, checked in its file before it is run."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from fus3dmaps_core.encoders.optional_packages import import_optional
-from fus3dmaps_core.segmenters.fastsam.proposals import PROTOTYPES, STRIDE
+from fus3dmaps_core.segmenters.fastsam.decoding import PROTOTYPES, STRIDE
 from fus3dmaps_core.segmenters.fastsam.published import refusal
 
 _STRIDES = (8, 16, 32)  # Of the three grids whose cells are the anchors.
@@ -14,7 +14,7 @@ _VALUES = 4 + 1 + PROTOTYPES  # Box, score and weights of an anchor.
 
 
 def input_shape(path: Path) -> tuple[int, int]:
-    """Height and width of the images that an exported network takes, pixels.
+    """Check an exported network and return height and width of the images that it takes, pixels.
 
     Args:
         path: ONNX file.
@@ -48,7 +48,7 @@ def input_shape(path: Path) -> tuple[int, int]:
 
 
 def _described(onnx: Any, value: Any) -> tuple[str, tuple[int | str, ...]]:
-    """Type and shape of an input or output; sides that are not fixed have their name, or "?"."""
+    """Return type and shape of an input or output; sides that are not fixed have their name, or "?"."""
     tensor = value.type.tensor_type
     sides = (side.dim_value if side.HasField("dim_value") else side.dim_param or "?" for side in tensor.shape.dim)
     return str(onnx.TensorProto.DataType.Name(tensor.elem_type)), tuple(sides)

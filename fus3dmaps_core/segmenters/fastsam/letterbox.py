@@ -17,8 +17,8 @@ class Letterbox:
 
     Attributes:
         shape: Height and width of the input, pixels.
-        height: Of the image in the input, pixels.
-        width: Of the image in the input, pixels.
+        height: Height of the image in the input, pixels.
+        width: Width of the image in the input, pixels.
         top: Rows of grey above it.
         left: Columns of grey on its left.
     """
@@ -38,7 +38,7 @@ class Letterbox:
         return cls(shape, height, width, (shape[0] - height) // 2, (shape[1] - width) // 2)
 
     def fit(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The (height, width, 3) uint8 input for an (H, W, 3) uint8 image."""
+        """Make the (height, width, 3) uint8 input for an (H, W, 3) uint8 image."""
         if rgb.shape[:2] != (self.height, self.width):
             rgb = np.asarray(cv2.resize(rgb, (self.width, self.height), interpolation=cv2.INTER_LINEAR), np.uint8)
         if (self.height, self.width) == self.shape:

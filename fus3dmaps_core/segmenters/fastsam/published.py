@@ -29,10 +29,10 @@ FILES = (FASTSAM_S, FASTSAM_X)
 
 
 def find_network(value: str) -> Path:
-    """Path of the exported network.
+    """Find the exported network.
 
     Args:
-        value: Of the parameter ``segmenter.weights``: the file, or a directory that holds ``FastSAM-s.onnx`` or
+        value: Value of the parameter ``segmenter.weights``: the file, or a directory that holds ``FastSAM-s.onnx`` or
             ``FastSAM-x.onnx``; "" for this package's own cache.
 
     Raises:
@@ -56,7 +56,7 @@ def find_network(value: str) -> Path:
 
 
 def refusal(reason: str) -> EncoderError:
-    """The error that says why there is no network to run, and how to get it."""
+    """Make the error that says why there is no network to run, and how to get one."""
     return EncoderError(
         f"parameter '{PARAMETER}': FastSAM: {reason}; export it once with the package ultralytics (code and weights "
         f"AGPL-3.0) by 'yolo export model=FastSAM-s.pt format=onnx imgsz=480,640 opset=17', and put "

@@ -1,4 +1,4 @@
-"""Masks of everything in a frame, by FastSAM's network and our own work before and after it."""
+"""Masks of everything in a frame, by FastSAM's network with pre- and post-processing of our own."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fus3dmaps_core.encoders.graphs import Network
+from fus3dmaps_core.encoders.network_graphs import Network
 from fus3dmaps_core.masks import Masks
+from fus3dmaps_core.segmenters.fastsam.decoding import masks_of, select
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.fastsam.proposals import masks_of, select
 
 
 class FastSamSegmenter:
-    """Proposes masks at the image's own size, best first. As safe to use from several threads as its network."""
+    """FastSAM's segmenter: masks at the image's own size, best first. As safe to use from several threads as its network."""
 
     def __init__(self, network: Network, shape: tuple[int, int], device: str) -> None:
         """Keep the network.

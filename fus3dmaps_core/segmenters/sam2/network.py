@@ -1,4 +1,4 @@
-"""SAM 2.1 Hiera tiny as transformers has it: built without a network, its weights those of the published video model."""
+"""SAM 2.1 Hiera tiny as transformers has it: built offline, with the weights of the published video model."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ _TWINS = ("shared_image_embedding.positional_embedding", "prompt_encoder.shared_
 
 
 def build_sam2(side: int = SIDE) -> Any:
-    """The ``Sam2Model`` with random weights, on the CPU.
+    """Build the ``Sam2Model`` with random weights, on the CPU.
 
     Args:
-        side: Of the square images it takes, pixels, a multiple of 128; its parameters are the same for any.
+        side: Side of the square images it takes, pixels, a multiple of 128; its parameters are the same for any.
 
     Raises:
         EncoderError: The package ``transformers`` is missing or has no SAM 2.
@@ -53,7 +53,7 @@ def build_sam2(side: int = SIDE) -> Any:
 
 
 def load_sam2(weights: str, side: int = SIDE) -> Any:
-    """The ``Sam2Model`` with its published weights, or those that ``segmenter.weights`` says, on the CPU.
+    """Load the ``Sam2Model`` onto the CPU, with its published weights or those that ``segmenter.weights`` names.
 
     Raises:
         EncoderError: A package or the weights are missing, damaged, or another architecture's.
@@ -66,7 +66,7 @@ def load_sam2(weights: str, side: int = SIDE) -> Any:
 
 
 def image_weights(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """The part of the video model's weights that single images need, by the names of ``Sam2Model``."""
+    """Select the video model's weights that single images need, by the names of ``Sam2Model``."""
     kept = {name: value for name, value in state.items() if not name.startswith(_OF_VIDEO)}
     for missing, present in (_TWINS, _TWINS[::-1]):
         if missing not in kept and present in kept:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import torch
 
-from fus3dmaps_core.segmenters.proposals import stability
+from fus3dmaps_core.segmenters.mask_tensors import stability
 
 
 @dataclass(frozen=True)
 class PointSettings:
-    """How many points are asked, and which of their masks are taken; the thresholds are those of SAM 2's authors.
+    """The number of points, and the thresholds that choose among their masks, as SAM 2's authors use them.
 
     Attributes:
         per_side: Points along each side of the image.
@@ -43,7 +43,7 @@ class PointMasks(NamedTuple):
 
 
 def point_grid(per_side: int, side: int, device: torch.device) -> torch.Tensor:
-    """(per_side^2, 2) float32 x, y: centres of equal cells of a square image with sides of so many pixels, row by row."""
+    """Place points at the centres of equal cells of a square image: (per_side^2, 2) float32 x, y, row by row."""
     centres = (torch.arange(per_side, dtype=torch.float32, device=device) + 0.5) * (side / per_side)
     y, x = torch.meshgrid(centres, centres, indexing="ij")
     return torch.stack([x.flatten(), y.flatten()], dim=1)

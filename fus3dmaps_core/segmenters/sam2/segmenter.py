@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch.nn import functional
 
 from fus3dmaps_core.masks import Masks
-from fus3dmaps_core.segmenters.proposals import (
+from fus3dmaps_core.segmenters.mask_tensors import (
     best_first,
     box_overlaps,
     first_of_overlapping,
@@ -21,7 +21,7 @@ from fus3dmaps_core.segmenters.proposals import (
 from fus3dmaps_core.segmenters.sam2.points import PointSettings, masks_at_points, point_grid
 
 MEAN = (0.485, 0.456, 0.406)
-"""Of red, green and blue in [0, 1], which SAM 2's images are normalised with."""
+"""Mean of red, green and blue in [0, 1], with which SAM 2's images are normalised."""
 STD = (0.229, 0.224, 0.225)
 
 MAX_BOX_IOU = 0.7
@@ -31,7 +31,7 @@ MAX_PROPOSALS = 300
 
 
 class Sam2Segmenter:
-    """Proposes masks at the image's own size, best first. Safe to use from several threads."""
+    """SAM 2's segmenter, which proposes masks at the image's own size, best first. Safe to use from several threads."""
 
     def __init__(self, network: Any, device: str, settings: PointSettings | None = None) -> None:
         """Keep the network.
@@ -65,7 +65,7 @@ class Sam2Segmenter:
             return masks_at(logits[kept], height, width)
 
     def _input(self, rgb: NDArray[np.uint8]) -> torch.Tensor:
-        """(1, 3, side, side) normalised."""
+        """Make the network's (1, 3, side, side) normalised input."""
         image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device).permute(2, 0, 1)[None].float()
         size = (self._side, self._side)
         image = functional.interpolate(image, size, mode="bilinear", align_corners=False, antialias=True)

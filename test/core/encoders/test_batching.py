@@ -80,7 +80,7 @@ def test_memory_that_runs_out_later_halves_again_and_repeats_nothing():
 
 
 def shrunk(room: int, first: int) -> tuple[SmallDevice, Batches]:
-    """A device of that much room, and batches that have met its end with so many images at first."""
+    """Make a device with that much room, and batches that ran out of it with so many images at first."""
     device, batches = SmallDevice(room), Batches("crops")
     batches.run(device, first)
     batches._fitted = 0  # What fitted meanwhile counts; the tests count from nothing.

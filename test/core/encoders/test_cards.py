@@ -10,17 +10,19 @@ from hypothesis import strategies as st
 
 from fus3dmaps_core.encoders import registry
 from fus3dmaps_core.encoders.cards import EncoderCard
+from fus3dmaps_core.encoders.definition import EncoderDefinition
 from fus3dmaps_core.errors import EncoderError
 
 SIDES = st.integers(1, 2000)
 
 
 def a_card(patch_px: int, grid_multiple: int = 1) -> EncoderCard:
-    return EncoderCard("a", "A pair.", 8, 1.0, patch_px, "", (), (), grid_multiple=grid_multiple)
+    return EncoderCard("a", "A trio.", 8, 1.0, patch_px, "", (), (), grid_multiple=grid_multiple)
 
 
 @pytest.mark.parametrize("name", registry.names())
 def test_every_trio_has_a_card_that_says_all(name):
+    assert isinstance(registry.definition(name), EncoderDefinition)
     card = registry.card(name)
     assert card.name == name
     assert card.summary.endswith(".")

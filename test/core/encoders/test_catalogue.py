@@ -24,7 +24,7 @@ WORDS = WeightFile("The words", "words.json", "https://example.org/words.json", 
 
 @pytest.fixture(autouse=True)
 def a_bare_machine(tmp_path, monkeypatch):
-    """Empty caches, and a network that must not be asked."""
+    """Give the test empty caches, and a network that must not be asked."""
 
     def refuse(*_arguments, **_options):
         raise AssertionError("the network was asked")
@@ -41,7 +41,7 @@ def a_bare_machine(tmp_path, monkeypatch):
 def a_card(**values) -> EncoderCard:
     plain = {
         "name": "a",
-        "summary": "A pair.",
+        "summary": "A trio.",
         "dimension": 8,
         "variance_ratio": 1.0,
         "patch_px": 16,
@@ -54,7 +54,7 @@ def a_card(**values) -> EncoderCard:
 
 @pytest.fixture
 def registered(monkeypatch):
-    """Puts cards in place of the registry's."""
+    """Put cards in place of the registry's."""
 
     def put(*cards: EncoderCard) -> None:
         by_name = {card.name: card for card in cards}

@@ -1,10 +1,11 @@
-"""Devices that torch cannot use are refused in one short line."""
+"""Devices that torch cannot use are refused in one short line, and half precision is for GPUs."""
 
 from __future__ import annotations
 
 import pytest
+import torch
 
-from fus3dmaps_core.encoders.devices import check_device
+from fus3dmaps_core.encoders.devices import check_device, default_dtype
 from fus3dmaps_core.errors import EncoderError
 
 
@@ -20,3 +21,8 @@ def test_what_cannot_be_used_is_named_in_one_short_line(device):
 
 def test_the_processor_can_be_used():
     check_device("cpu")
+
+
+def test_half_precision_is_for_gpus():
+    assert default_dtype("cpu") is torch.float32
+    assert default_dtype("cuda:0") is torch.bfloat16

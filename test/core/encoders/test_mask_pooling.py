@@ -22,7 +22,7 @@ def embeddings(weights=None, values=AXES) -> PatchEmbeddings:
 
 
 def edge_distance(mask: np.ndarray, y: int, x: int) -> float:
-    """Distance of a pixel to the nearest one outside of the mask; without any, more than the image holds."""
+    """Measure the distance of a pixel to the nearest one outside of the mask; without any, more than the image holds."""
     outside = np.argwhere(~mask)
     if not len(outside):
         return float(sum(mask.shape))

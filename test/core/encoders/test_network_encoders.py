@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import nn
 
-from fus3dmaps_core.encoders.graphs import GraphEncoder
 from fus3dmaps_core.encoders.network_encoders import NetworkCropEncoder, NetworkPatchEncoder
+from fus3dmaps_core.encoders.network_graphs import GraphEncoder
 from fus3dmaps_core.masks import Masks
 
 MEAN, STD = (0.5, 0.4, 0.3), (0.2, 0.25, 0.5)

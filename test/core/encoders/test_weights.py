@@ -46,7 +46,7 @@ def own_caches(tmp_path, monkeypatch):
 
 @pytest.fixture
 def server(tmp_path):
-    """Files of a folder at an address of this machine."""
+    """Serve the files of a folder at an address of this machine."""
     folder = tmp_path / "published"
     folder.mkdir()
     handler = functools.partial(http.server.SimpleHTTPRequestHandler, directory=str(folder))
@@ -196,7 +196,7 @@ def test_what_is_no_name_of_a_repository_is_taken_for_a_path(value):
 
 
 def deny(monkeypatch, method: str, denied: Path) -> None:
-    """What another user's files say; a test may run as root, whom nothing is denied."""
+    """Refuse as another user's files do; a test may run as root, whom nothing is denied."""
     whole = getattr(Path, method)
 
     def refusing(path, *arguments, **options):

@@ -24,7 +24,7 @@ RAYS = [(0.0, 0.0), (0.21, -0.13), (-0.33, 0.24), (0.38, 0.29), (-0.4, -0.3)]
 
 
 def distorted(x: float, y: float, lens: Distortion) -> tuple[float, float]:
-    """Where a lens moves the ray (x, y, 1)."""
+    """Move the ray (x, y, 1) as a lens does."""
     if lens.model == "equidistant":
         radius = np.hypot(x, y)
         if radius == 0:
@@ -49,7 +49,7 @@ def pixel(x: float, y: float, camera: Intrinsics) -> tuple[float, float]:
 
 
 def sources(lens: Distortion, camera: Intrinsics) -> np.ndarray:
-    """For each pixel of the pinhole camera, where the lens shows its ray, (H, W, 2) column and row."""
+    """Find for each pixel of the pinhole camera where the lens shows its ray, (H, W, 2) column and row."""
     return np.array(
         [
             [

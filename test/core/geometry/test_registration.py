@@ -42,7 +42,7 @@ class Plane:
         self.normal, self.distance, self.x_from, self.x_to = np.array(normal, float), distance, x_from, x_to
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> float:
-        """How many directions from the origin the plane is, inf if it is not met."""
+        """Return how many directions away from the origin the plane is; inf if it is not met."""
         across = self.normal @ direction
         along = (self.distance - self.normal @ origin) / across if across else np.inf
         x = origin[0] + along * direction[0] if np.isfinite(along) else np.nan
@@ -50,7 +50,7 @@ class Plane:
 
 
 def cast(planes, camera: Intrinsics, T_depth_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Depth along the camera's axis at every pixel, 0 where nothing is met, and the points in the depth camera's frame."""
+    """Cast rays: depth along the axis at every pixel, 0 where nothing is met, and the points in the depth camera's frame."""
     depth, points = np.zeros((camera.height, camera.width)), np.full((camera.height, camera.width, 3), np.nan)
     origin = T_depth_camera[:3, 3]
     for v in range(camera.height):
@@ -64,7 +64,7 @@ def cast(planes, camera: Intrinsics, T_depth_camera: np.ndarray) -> tuple[np.nda
 
 
 def seen_by_depth_camera(points: np.ndarray, margin: float) -> np.ndarray:
-    """Which points lie inside the depth camera's image, by a margin of pixels."""
+    """Tell which points lie inside the depth camera's image, by a margin of pixels."""
     u = DEPTH.fx * points[..., 0] / points[..., 2] + DEPTH.cx
     v = DEPTH.fy * points[..., 1] / points[..., 2] + DEPTH.cy
     return (u > margin) & (u < DEPTH.width - 1 - margin) & (v > margin) & (v < DEPTH.height - 1 - margin)
@@ -118,7 +118,7 @@ def test_what_is_near_hides_what_is_far(camera):
 
 
 def away_from_steps(depth: np.ndarray, pixels: int) -> np.ndarray:
-    """Which pixels have the same depth so many pixels to the left and right."""
+    """Tell which pixels have the same depth so many pixels to the left and right."""
     padded = np.pad(depth, ((0, 0), (pixels, pixels)), mode="edge")
     shifts = [padded[:, i : i + depth.shape[1]] for i in range(2 * pixels + 1)]
     return np.all([np.isclose(shift, depth) for shift in shifts], axis=0)

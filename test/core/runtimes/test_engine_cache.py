@@ -9,6 +9,7 @@ from tensorrt_stand_in import TensorRT
 
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes.engine_cache import Gpu, cached_engine, engine_path
+from fus3dmaps_core.runtimes.tensorrt_engine import WORKSPACE_MIB
 
 ORIN, DESKTOP = Gpu("Orin (nvgpu)", (8, 7)), Gpu("NVIDIA GeForce RTX 4090", (8, 9))
 SHAPE = (2, 3, 4, 4)
@@ -44,9 +45,9 @@ def test_an_engine_is_built_once(graph, folder):
 
 def test_the_network_is_strongly_typed_and_built_from_the_file_within_the_limit(graph, folder):
     tensorrt = TensorRT()
-    cached_engine(tensorrt, graph, SHAPE, "fp16", ORIN, folder, workspace_mib=300)
+    cached_engine(tensorrt, graph, SHAPE, "fp16", ORIN, folder)
     assert ("build", 1 << tensorrt.NetworkDefinitionCreationFlag.STRONGLY_TYPED, graph) in tensorrt.log
-    assert ("limit", "workspace", 300 << 20) in tensorrt.log
+    assert ("limit", "workspace", WORKSPACE_MIB << 20) in tensorrt.log
     assert ("clear", "tf32") in tensorrt.log
 
 

@@ -1,4 +1,4 @@
-"""Want of memory in all the words in which libraries say it, and nothing else, is refused by the size of the images."""
+"""Lack of memory in all the words in which libraries say it, and nothing else, is refused by the size of the images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def failing(error: Exception):
 
 
 def wrapped(said: str) -> None:
-    """As the compiler's want of memory is told: by an error of our own, which hides what led to it."""
+    """Raise lack of memory as the compiler's is told: in an error of our own, which hides what led to it."""
     try:
         torch.zeros(SIDE, SIDE)
     except RuntimeError:

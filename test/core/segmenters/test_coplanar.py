@@ -10,7 +10,7 @@ HEIGHT, WIDTH = 60, 80
 
 
 def plane_depth_m(a: float, b: float, c: float) -> np.ndarray:
-    """Depth of a plane seen by a pinhole camera: 1 / z is affine in pixel coordinates."""
+    """Compute the depth of a plane seen by a pinhole camera: 1 / z is affine in pixel coordinates."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     return (1 / (a * u / WIDTH + b * v / HEIGHT + c)).astype(np.float32)
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from fus3dmaps_core.config.schema import EncoderConfig
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.segmenters.fastsam.decoding import MAX_PROPOSALS, masks_of, select
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.fastsam.proposals import MAX_PROPOSALS, masks_of, select
 from fus3dmaps_core.segmenters.fastsam.segmenter import FastSamSegmenter
 from fus3dmaps_core.segmenters.registry import load_segmenter
 
@@ -25,7 +25,7 @@ def anchors(shape=SHAPE) -> int:
 
 
 def some_outputs(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Detections with equal scores, equal boxes and few confident ones, and prototypes."""
+    """Make detections with equal scores, equal boxes and few confident ones, and prototypes."""
     rng = np.random.default_rng(seed)
     n = anchors()
     predictions = np.zeros((37, n), np.float32)
@@ -46,7 +46,7 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def plain_select(predictions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Boxes and coefficients of what remains, highest score first."""
+    """Return boxes and coefficients of what remains, highest score first."""
     rows = [row for row in range(predictions.shape[1]) if predictions[4, row] > 0.4]
     rows.sort(key=lambda row: -predictions[4, row])
     kept: list[tuple[np.ndarray, np.ndarray]] = []
@@ -59,7 +59,7 @@ def plain_select(predictions: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]
 
 
 def plain_masks(kept, prototypes: np.ndarray, height: int, width: int) -> tuple[list[np.ndarray], bool]:
-    """Masks at the size of the image, and whether rounding could change any of them."""
+    """Make masks at the size of the image, and tell whether rounding could change any of them."""
     gain = min(SHAPE[0] / height, SHAPE[1] / width)
     inner_height, inner_width = round(height * gain), round(width * gain)
     top, left = (SHAPE[0] - inner_height) // 2, (SHAPE[1] - inner_width) // 2
@@ -93,7 +93,7 @@ def plain_masks(kept, prototypes: np.ndarray, height: int, width: int) -> tuple[
 
 
 def bilinear(logits, x, y, top, left, inner_height, inner_width) -> float:
-    """Value at a place in cells, whose centres are at halves; outside the image's cells the nearest counts."""
+    """Interpolate at a place in cells, whose centres are at halves; outside the image's cells the nearest counts."""
     first_row, last_row = top // 4, -(-(top + inner_height) // 4) - 1
     first_column, last_column = left // 4, -(-(left + inner_width) // 4) - 1
     row, column = int(np.floor(y - 0.5)), int(np.floor(x - 0.5))

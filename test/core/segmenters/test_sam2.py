@@ -99,7 +99,7 @@ class Rectangles(KnownAnswers):
 
 
 def plain_choice(masks: np.ndarray, scores: np.ndarray) -> list[np.ndarray]:
-    """Box by box, then mask by mask: whatever is too like a better one is dropped."""
+    """Choose box by box, then mask by mask: whatever is too like a better one is dropped."""
     boxes = []
     for mask in masks:
         filled = np.zeros_like(mask)

@@ -1,4 +1,4 @@
-"""Pairs with random weights, a short recording, and the maps that the pairs make of it without ROS."""
+"""Trios with random weights, a short recording, and the maps that the trios make of it without ROS."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ SETTINGS = {
     "segmenter.max_masks": 2,
     "node.service_timeout_s": 120.0,
 }
-"""What all pairs are given: small images, and few crops of them."""
+"""Settings of all trios: small images, and few crops of them."""
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory) -> Path:
-    """Keyframes of both layers, and nothing else."""
+    """Record keyframes of both layers, and nothing else."""
     path = tmp_path_factory.mktemp("recording") / "room.mcap"
     room = FurnishedRoom(frames=30)
     with RecordingWriter(path) as writer:
@@ -38,7 +38,7 @@ def recording(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory) -> Iterator[WeightsCache]:
-    """Weights for as long as they are needed: pytest keeps what tests leave, and these take a gigabyte."""
+    """Keep weights for as long as they are needed: pytest keeps what tests leave, and these take a gigabyte."""
     root = tmp_path_factory.mktemp("cache")
     yield write_weights(root)
     shutil.rmtree(root)
@@ -46,23 +46,23 @@ def cache(tmp_path_factory) -> Iterator[WeightsCache]:
 
 @pytest.fixture(scope="session")
 def maps(tmp_path_factory) -> Path:
-    """The directory of saved maps."""
+    """Make the directory of saved maps."""
     return tmp_path_factory.mktemp("maps")
 
 
 @pytest.fixture(scope="session")
 def parameters(maps) -> Callable[[str], dict[str, object]]:
-    """Every parameter of a node or pipeline with the pair of a name."""
+    """Return every parameter of a node or pipeline with the trio of a name."""
 
-    def of_pair(name: str) -> dict[str, object]:
+    def of_trio(name: str) -> dict[str, object]:
         return {**SETTINGS, "node.map_directory": str(maps), "encoder.name": name}
 
-    return of_pair
+    return of_trio
 
 
 @pytest.fixture
 def cached(cache, monkeypatch) -> None:
-    """This process finds the weights, too."""
+    """Let this process find the weights, too."""
     for variable, value in cache.environment.items():
         monkeypatch.setenv(variable, value)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(Path(cache.environment["HF_HOME"]) / "hub"))

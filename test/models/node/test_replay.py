@@ -1,4 +1,4 @@
-"""Every large pair maps a recording, offline and in a live node, and keeps to its own maps; one parameter switches them."""
+"""Every large trio maps a recording, offline and in a live node, and keeps to its own maps; one parameter switches them."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ from fus3dmaps_ros.topics.outputs import LATCHED
 NODE = Path(__file__).with_name("random_weights_node.py")
 FRAMES = 2  # Of the recording, as conftest.py writes it.
 PROMPT = "a red cup"
-PAIRS = [name for name in names() if name != "lite"]
+TRIOS = [name for name in names() if name != "lite"]
 
 
 def another_than(name: str) -> str:
-    return PAIRS[(PAIRS.index(name) + 1) % len(PAIRS)]
+    return TRIOS[(TRIOS.index(name) + 1) % len(TRIOS)]
 
 
 @pytest.fixture
 def offline(cached, recording, maps, config) -> Any:
-    """Maps the recording in this process with the pair of a name, once, and saves the map under ``offline_NAME``."""
+    """Map the recording in this process with the trio of a name, once, and save the map under ``offline_NAME``."""
 
     def mapped(name: str) -> Path:
         path = maps / f"offline_{name}"
@@ -66,7 +66,7 @@ def call(user: Any, service_type: Any, service: str, **fields: Any) -> Any:
     return future.result()
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", TRIOS)
 def test_a_recording_gives_the_same_map_twice(cached, recording, config, offline, name):
     first, info = load_map(offline(name))
     pipeline = Pipeline.from_config(config(name))
@@ -87,13 +87,13 @@ def test_a_recording_gives_the_same_map_twice(cached, recording, config, offline
         assert np.isfinite(answer.similarity).all()
 
 
-def test_one_parameter_switches_pairs(parameters):
-    first, *others = (parameters(name) for name in PAIRS)
+def test_one_parameter_switches_trios(parameters):
+    first, *others = (parameters(name) for name in TRIOS)
     for other in others:
         assert {name for name in first.keys() | other.keys() if first.get(name) != other.get(name)} == {"encoder.name"}
 
 
-@pytest.mark.parametrize("name", PAIRS)
+@pytest.mark.parametrize("name", TRIOS)
 def test_a_node_maps_a_replay_and_keeps_to_its_own_maps(start, user, signals, cache, recording, parameters, offline, name):
     own, other = offline(name), offline(another_than(name))
     statuses: list[MapperStatus] = []
@@ -132,8 +132,8 @@ def test_a_node_maps_a_replay_and_keeps_to_its_own_maps(start, user, signals, ca
     assert f"loading encoder '{name}'" in end(node, signal.SIGINT)
 
 
-@pytest.mark.parametrize("name", PAIRS)
-def test_a_saved_map_is_asked_in_the_words_of_its_own_pair(offline, config, monkeypatch, capsys, name):
+@pytest.mark.parametrize("name", TRIOS)
+def test_a_saved_map_is_asked_in_the_words_of_its_own_trio(offline, config, monkeypatch, capsys, name):
     monkeypatch.setattr(sys, "argv", ["fus3dmaps", "query", str(offline(name)), PROMPT, "--json"])
     capsys.readouterr()
     with pytest.raises(SystemExit) as ended:
@@ -142,16 +142,16 @@ def test_a_saved_map_is_asked_in_the_words_of_its_own_pair(offline, config, monk
     assert len(json.loads(capsys.readouterr().out))
 
 
-@pytest.mark.parametrize("name", PAIRS)
-def test_a_saved_map_refuses_the_words_of_another_pair(cached, offline, name):
+@pytest.mark.parametrize("name", TRIOS)
+def test_a_saved_map_refuses_the_words_of_another_trio(cached, offline, name):
     other = another_than(name)
     semantic_map, info = load_map(offline(name))
     with pytest.raises(QueryError, match=rf"embedded by encoder '{other}', the map was built with '{name}'"):
         answer_query(semantic_map, load_text_encoder(other, "cpu"), TextQuery([PROMPT]), info.logit_scale)
 
 
-@pytest.mark.parametrize("name", PAIRS)
-def test_a_pipeline_refuses_the_map_of_another_pair(offline, config, name):
+@pytest.mark.parametrize("name", TRIOS)
+def test_a_pipeline_refuses_the_map_of_another_trio(offline, config, name):
     other = another_than(name)
     fresh = SimpleNamespace(dimension=card(other).dimension)
     with pytest.raises(StorageError, match=rf"its encoder is '{name}', here '{other}'"):

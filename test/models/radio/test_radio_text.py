@@ -9,8 +9,8 @@ from open_clip.zero_shot_metadata import OPENAI_IMAGENET_TEMPLATES
 from tokenizers import Tokenizer
 
 from fus3dmaps_core.encoders import siglip_text
+from fus3dmaps_core.encoders.radio.loading import load_text_encoder
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
-from fus3dmaps_core.encoders.radio.pair import load_text_encoder
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
 from fus3dmaps_core.encoders.siglip2.published import TEXT
 from fus3dmaps_core.encoders.siglip_text import SiglipTextEncoder, build_tower, canonical, read_text
@@ -22,7 +22,7 @@ def test_a_prompt_is_the_unit_mean_of_its_unit_sentences(loaded):
     for template in OPENAI_IMAGENET_TEMPLATES:
         sentence = template("red cup").lower().replace(".", "").replace("-", "")
         ids = [*tokenizer.encode(sentence).ids, 1]
-        ids = torch.tensor([ids + [loaded.pair.text.pad_id] * (64 - len(ids))])
+        ids = torch.tensor([ids + [loaded.variant.text.pad_id] * (64 - len(ids))])
         with torch.inference_mode():
             rows.append(loaded.tower(input_ids=ids, position_ids=torch.arange(64)[None]).pooler_output[0].double().numpy())
     lengths = np.linalg.norm(rows, axis=1)
@@ -45,7 +45,7 @@ def test_any_text_is_embedded_and_none_depends_on_the_others(loaded):
 def test_the_text_encoder_alone_is_the_trios_and_needs_nothing_of_radio(loaded, tmp_path):
     for name in ("model.safetensors", "tokenizer.json"):
         (tmp_path / name).symlink_to(loaded.folder / name)
-    alone = load_text_encoder(loaded.pair, "cpu", str(tmp_path))
+    alone = load_text_encoder(loaded.variant, "cpu", str(tmp_path))
     assert np.array_equal(alone.encode_text(["a blue cup"]), loaded.trio.text.encode_text(["a blue cup"]))
 
 
@@ -58,15 +58,15 @@ def test_the_end_of_what_is_too_long_stays(loaded):
     assert tokens.shape == (3, 64)
     assert (tokens[0, :63] == tokens[0, 0]).all()
     assert tokens[0, 63] == tokens[1, 1] == tokens[2, 0] == 1
-    assert (tokens[1, 2:] == loaded.pair.text.pad_id).all()
+    assert (tokens[1, 2:] == loaded.variant.text.pad_id).all()
 
 
-@pytest.mark.parametrize(("pair", "vocabulary"), [(NARADIO, 32_000), (RADSEG, 256_000)])
-def test_the_published_towers_have_their_published_sizes(pair, vocabulary):
-    tower = build_tower(pair.text, pair.name)
+@pytest.mark.parametrize(("variant", "vocabulary"), [(NARADIO, 32_000), (RADSEG, 256_000)])
+def test_the_published_towers_have_their_published_sizes(variant, vocabulary):
+    tower = build_tower(variant.text, variant.name)
     width, hidden = 1152, 4304
     block = 4 * (width + 1) * width + (2 * hidden + 1) * width + hidden + 4 * width
-    rest = (vocabulary + 64 + 2) * width + (width + 1) * pair.dimension
+    rest = (vocabulary + 64 + 2) * width + (width + 1) * variant.dimension
     assert sum(parameter.numel() for parameter in tower.parameters()) == 27 * block + rest
     assert tower.config.hidden_act == "gelu_pytorch_tanh"
 
@@ -87,7 +87,7 @@ def test_who_asks_a_large_tower_on_the_processor_is_told_to_wait(loaded, monkeyp
     """A device without values stands for all that are not the processor."""
     monkeypatch.setattr(siglip_text, "_SLOW_PRODUCTS", slow)
     files = loaded.folder / "model.safetensors", loaded.folder / "tokenizer.json"
-    read_text(loaded.pair.text, *files, device, loaded.pair.name)
+    read_text(loaded.variant.text, *files, device, loaded.variant.name)
     lines = [record.message for record in caplog.records if "on the CPU" in record.message]
     assert len(lines) == warned
-    assert all(f"encoder '{loaded.pair.name}'" in line and "'encoder.device'" in line for line in lines)
+    assert all(f"encoder '{loaded.variant.name}'" in line and "'encoder.device'" in line for line in lines)

@@ -11,7 +11,7 @@ from fus3dmaps_core.encoders.registry import load_trio
 
 
 @pytest.fixture(scope="session")
-def pairs(tmp_path_factory) -> dict[str, EncoderTrio]:
+def trios(tmp_path_factory) -> dict[str, EncoderTrio]:
     return {
         "lite": load_trio("lite", "cpu", 0.05),
         "clip_dinoiser": narrow_clip_dinoiser(),

@@ -10,9 +10,9 @@ from graph_trios import toy_trio
 from onnx import numpy_helper
 
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes import exporting, onnx_export
+from fus3dmaps_core.runtimes import exporting, onnx_writer
+from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.exporting import export_graph, graph_encoders
-from fus3dmaps_core.runtimes.files import external_data
 from fus3dmaps_core.runtimes.graph_files import is_whole
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
 from fus3dmaps_core.runtimes.parity import BOUNDS, Bound, compare
@@ -96,7 +96,7 @@ def test_a_network_that_torch_cannot_export_is_named(toy, tmp_path):
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16", "bf16"])
 def test_weights_too_large_for_one_file_lie_beside_it(toy, tmp_path, monkeypatch, precision):
-    monkeypatch.setattr(onnx_export, "_LARGEST_INSIDE_BYTES", 0)
+    monkeypatch.setattr(onnx_writer, "_LARGEST_INSIDE_BYTES", 0)
     found = export_graph(graph_encoders(toy)[0], precision, tmp_path, *SIZE)
     beside = external_data(found.path)
     assert beside.is_file()

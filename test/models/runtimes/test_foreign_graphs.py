@@ -19,7 +19,7 @@ SHAPE = (1, 3, 16, 24)
 
 
 def write_graph(path: Path, scale: float = 1.0, seed: int = 0) -> Path:
-    """Two convolutions with a sigmoid between, and no types but at the ends, as other exporters leave them out."""
+    """Write two convolutions with a sigmoid between, and types only at the ends, as other exporters leave them out."""
     rng = np.random.default_rng(seed)
     weights = {
         "first": scale * rng.normal(size=(8, 3, 3, 3)),

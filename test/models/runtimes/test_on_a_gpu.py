@@ -9,8 +9,8 @@ import torch
 from graph_trios import toy_trio
 
 from fus3dmaps_core.runtimes.compiled_network import CompiledNetwork
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.exporting import export_graph, graph_encoders
-from fus3dmaps_core.runtimes.opening import open_network
 from fus3dmaps_core.runtimes.packages import import_onnxruntime
 from fus3dmaps_core.runtimes.tensorrt_network import engine_of
 

@@ -11,15 +11,15 @@ import torch
 from onnx import TensorProto, helper
 
 from fus3dmaps_core.errors import EncoderError
+from fus3dmaps_core.runtimes.exported_network import open_network
 from fus3dmaps_core.runtimes.graph_input import input_shape
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
-from fus3dmaps_core.runtimes.opening import open_network
 
 SHAPE = (3, 3, 4, 6)
 
 
 def write(path: Path, shape=SHAPE, kind=TensorProto.FLOAT, inputs=1, result=TensorProto.FLOAT) -> Path:
-    """Twice the images, and their means by channel."""
+    """Write a graph that gives twice the images, and their means by channel."""
     given = [helper.make_tensor_value_info(f"images{place}", kind, shape) for place in range(inputs)]
     outputs = [helper.make_tensor_value_info(name, result, None) for name in ("double", "means")]
     nodes = [

@@ -34,7 +34,7 @@ def write_network(
     prototypes: tuple[int | str, ...] = (1, 32, HEIGHT // 4, WIDTH // 4),
     outputs: int = 2,
 ) -> Path:
-    """A network with fixed detections whose mask is where the red of the image is above 0.7, at a quarter of its sides."""
+    """Write a network with fixed detections whose mask is where the image's red is above 0.7, at a quarter of its sides."""
     values = np.zeros((37, ANCHORS), np.float32)
     for anchor, detection in enumerate(DETECTIONS):
         values[:5, 10 * anchor], values[5, 10 * anchor] = detection, 1.0
@@ -68,7 +68,7 @@ def write_network(
 
 
 def two_rectangles(height: int, width: int) -> np.ndarray:
-    """Bright on the left and on the right of a dark image, in parts of its sides that are whole cells of the network."""
+    """Draw bright rectangles left and right on a dark image, in whole cells of the network."""
     rgb = np.zeros((height, width, 3), np.uint8)
     rgb[height // 4 : height // 2, width // 6 : width // 3] = 255
     rgb[height // 2 : 3 * height // 4, 2 * width // 3 : 5 * width // 6] = 255

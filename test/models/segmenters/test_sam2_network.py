@@ -31,7 +31,7 @@ def network():
 
 @pytest.fixture(scope="module")
 def published() -> dict[str, torch.Tensor]:
-    """Weights as they are published: the video model's."""
+    """Make weights as they are published: the video model's."""
     torch.manual_seed(6)
     return Sam2VideoModel(Sam2VideoConfig()).state_dict()
 

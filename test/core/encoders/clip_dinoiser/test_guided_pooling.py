@@ -12,7 +12,7 @@ from fus3dmaps_core.encoders.clip_dinoiser.heads import WIDTH, DinoiserHeads
 
 
 def pooled_in_loops(features: np.ndarray, correlations: np.ndarray, threshold: float) -> np.ndarray:
-    """(d, rows, columns) features and (p, p) correlations of one image."""
+    """Pool (d, rows, columns) features by the (p, p) correlations of one image."""
     depth, rows, columns = features.shape
     result = np.zeros(features.shape)
     for patch in range(rows * columns):

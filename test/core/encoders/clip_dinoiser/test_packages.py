@@ -1,4 +1,4 @@
-"""Without the extra the pair is refused by name, and nothing of it is imported before."""
+"""Without the extra the trio is refused by name, and nothing of it is imported before."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from fus3dmaps_core.encoders.lite.network import EfficientNetLite0, load_classifier
-from fus3dmaps_core.encoders.lite.weights import CLASSIFIER, IMAGENET_NAMES
+from fus3dmaps_core.encoders.lite.packaged_files import CLASSIFIER, IMAGENET_NAMES
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +18,7 @@ def classifier() -> EfficientNetLite0:
 
 
 def plain_features(state: dict[str, torch.Tensor], x: torch.Tensor) -> torch.Tensor:
-    """The same network written as a list of operations on the raw weights, normalisation apart."""
+    """Run the same network written as a list of operations on the raw weights, normalisation apart."""
 
     def conv(name: str, x: torch.Tensor, stride: int = 1, groups: int = 1) -> torch.Tensor:
         weight = state[f"{name}.weight"]

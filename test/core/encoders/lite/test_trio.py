@@ -24,7 +24,7 @@ def trio() -> EncoderTrio:
 
 
 def on_a_wall(names: tuple[str, ...]) -> tuple[np.ndarray, Masks]:
-    """Photographs in a row on a grey wall, and their masks."""
+    """Put photographs in a row on a grey wall; return the picture and their masks."""
     rgb = np.full((256, 256 * len(names), 3), 180, np.uint8)
     masks = np.zeros((len(names), *rgb.shape[:2]), bool)
     for column, name in enumerate(names):

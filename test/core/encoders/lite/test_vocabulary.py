@@ -1,4 +1,4 @@
-"""The vocabulary's cache: kept, found again, and done without where it is broken or cannot be written."""
+"""The vocabulary's cache: kept, found again, and ignored where it is broken or cannot be written."""
 
 from __future__ import annotations
 

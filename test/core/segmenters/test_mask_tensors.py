@@ -1,4 +1,4 @@
-"""What is shared by segmenters of many overlapping masks, against plain loops and known answers."""
+"""Masks as tensors: which of overlapping ones stay, and their full size, against plain loops and known answers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from fus3dmaps_core.segmenters import proposals
-from fus3dmaps_core.segmenters.proposals import (
+from fus3dmaps_core.segmenters import mask_tensors
+from fus3dmaps_core.segmenters.mask_tensors import (
     best_first,
     box_overlaps,
     first_of_overlapping,
@@ -39,7 +39,7 @@ def plain_iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def plain_weights(pixels: int, cells: int, first: float, last: float) -> np.ndarray:
-    """(pixels, cells): what each cell gives to each pixel's centre, within the cells that the region touches."""
+    """Compute what each cell gives to each pixel's centre, within the cells that the region touches: (pixels, cells)."""
     weights = np.zeros((pixels, cells))
     lowest, highest = int(np.floor(first)), int(np.ceil(last)) - 1
     for pixel in range(pixels):
@@ -141,7 +141,7 @@ def test_what_lies_beside_the_image_does_not_reach_into_it():
 def test_many_masks_are_made_in_parts(monkeypatch):
     logits = torch.from_numpy(np.random.default_rng(0).normal(size=(9, 5, 6)).astype(np.float32))
     whole = masks_at(logits, 17, 23)
-    monkeypatch.setattr(proposals, "_CHUNK_PIXELS", 2 * 17 * 23)
+    monkeypatch.setattr(mask_tensors, "_CHUNK_PIXELS", 2 * 17 * 23)
     parts = masks_at(logits, 17, 23)
     assert np.array_equal(whole.masks, parts.masks)
     assert np.array_equal(whole.boxes, parts.boxes)

@@ -1,4 +1,4 @@
-"""What segmenters that propose many overlapping masks share: which proposals go, and masks at the image's own size.
+"""Masks as tensors: which of many overlapping ones stay, and how they are brought to the image's own size.
 
 All of it runs on the tensors' own device and gives the same result every time; equal scores keep the order they came in.
 """
@@ -16,12 +16,12 @@ _CHUNK_PIXELS = 1 << 21  # Of masks brought to the image's size at once; their l
 
 
 def best_first(scores: torch.Tensor, most: int) -> torch.Tensor:
-    """Rows of the highest (n,) scores, at most so many, highest first; equal ones in their order."""
+    """Return the rows of the ``most`` highest of (n,) scores, highest first; equal ones in their order."""
     return torch.argsort(scores, descending=True, stable=True)[:most]
 
 
 def first_of_overlapping(overlaps: torch.Tensor) -> torch.Tensor:
-    """Which rows remain when every row is dropped that overlaps a remaining one before it.
+    """Drop every row that overlaps a remaining one before it, and tell which rows remain.
 
     Args:
         overlaps: (n, n) bool, symmetric.
@@ -41,7 +41,7 @@ def first_of_overlapping(overlaps: torch.Tensor) -> torch.Tensor:
 
 
 def box_overlaps(boxes: torch.Tensor, iou: float) -> torch.Tensor:
-    """Which pairs of (n, 4) boxes x0, y0, x1, y1 have a larger intersection over union: (n, n) bool."""
+    """Tell which pairs of (n, 4) boxes x0, y0, x1, y1 have a larger intersection over union: (n, n) bool."""
     x0, y0, x1, y1 = boxes.unbind(dim=1)
     across = torch.minimum(x1[:, None], x1) - torch.maximum(x0[:, None], x0)
     down = torch.minimum(y1[:, None], y1) - torch.maximum(y0[:, None], y0)
@@ -51,7 +51,7 @@ def box_overlaps(boxes: torch.Tensor, iou: float) -> torch.Tensor:
 
 
 def mask_overlaps(masks: torch.Tensor, iou: float) -> torch.Tensor:
-    """Which pairs of (n, h, w) bool masks have a larger intersection over union: (n, n) bool; empty masks have none."""
+    """Tell which pairs of (n, h, w) bool masks have a larger intersection over union: (n, n) bool; empty masks have none."""
     flat = masks.flatten(1).float()  # Counts below 2^24 are exact in float32.
     shared = flat @ flat.T
     areas = flat.sum(dim=1)
@@ -59,7 +59,7 @@ def mask_overlaps(masks: torch.Tensor, iou: float) -> torch.Tensor:
 
 
 def stability(logits: torch.Tensor, offset: float) -> torch.Tensor:
-    """How little masks change with their threshold (Kirillov et al. 2023).
+    """Measure how little masks change with their threshold (Kirillov et al. 2023).
 
     Args:
         logits: (n, h, w), a mask is where they are above 0.
@@ -74,7 +74,7 @@ def stability(logits: torch.Tensor, offset: float) -> torch.Tensor:
 
 
 def tight_boxes(masks: torch.Tensor) -> torch.Tensor:
-    """Bounds of (n, h, w) bool masks: (n, 4) int32 x0, y0, x1, y1, the last two exclusive; empty masks have x1 <= x0."""
+    """Bound (n, h, w) bool masks by (n, 4) int32 x0, y0, x1, y1, the last two exclusive; empty masks have x1 <= x0."""
     bounds = []
     values = masks.view(torch.uint8)  # The largest of bytes is found many times faster than any of truth values.
     for occupied in (values.amax(dim=1) > 0, values.amax(dim=2) > 0):
@@ -92,13 +92,13 @@ def masks_at(
     region: tuple[float, float, float, float] | None = None,
     boxes: torch.Tensor | None = None,
 ) -> Masks:
-    """Masks at the size of the image, from logits on a coarser grid.
+    """Make masks at the size of the image from logits on a coarser grid.
 
     Args:
         logits: (n, h, w) float, a mask is where their bilinear interpolation at a pixel's centre is above 0; at the edges of
             the region the nearest cells count.
-        height: Of the image, pixels.
-        width: Of the image, pixels.
+        height: Height of the image, pixels.
+        width: Width of the image, pixels.
         region: Part of the grid that the image fills, x0, y0, x1, y1 in its cells; all of it if None.
         boxes: (n, 4) x0, y0, x1, y1 in pixels of the image, to which the masks are cut; a pixel with its upper left corner
             in the box is inside.

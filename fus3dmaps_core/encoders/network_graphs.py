@@ -1,6 +1,6 @@
 """Networks of encoders as graphs of fixed shape, for runtimes other than torch's own.
 
-Images alone go through them. Text towers stay in torch: a prompt comes once in a while and is short.
+Only images go through them. Text towers stay in torch: prompts are rare and short.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import nn
 
 Network = Callable[[torch.Tensor], torch.Tensor | tuple[torch.Tensor, ...]]
-"""Images in, one or several tensors out: a torch module, or what runs the same graph elsewhere."""
+"""Images in, one or several tensors out: a torch module, or something that runs the same graph elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -23,8 +23,8 @@ class Graph:
     Attributes:
         name: ``patch`` or ``crop``; with the trio's name it names files.
         network: On its device, in evaluation mode; takes one float32 tensor and returns one float32 tensor, or a tuple.
-        shape: Of its input: (n, 3, H, W), images as the encoder prepares them. Fewer than n are padded by who runs it.
-        outputs: Names of its outputs, in order; the first are embeddings along the last axis, or logits that become such.
+        shape: Shape of its input: (n, 3, H, W), images as the encoder prepares them. Whoever runs it pads fewer than n.
+        outputs: Names of its outputs, in order; the first has embeddings, or logits that become such, along the last axis.
     """
 
     name: str
@@ -38,9 +38,9 @@ class GraphEncoder(Protocol):
     """A patch or crop encoder whose network can be run elsewhere."""
 
     def graph(self, height: int, width: int) -> Graph:
-        """Its network at the shape it is run at for an image of this size, pixels."""
+        """Describe its network at the shape that it is run at for an image of this size, pixels."""
         ...
 
     def run_with(self, network: Network) -> None:
-        """Run this in place of the network; it takes and returns tensors of the encoder's device."""
+        """Run another network in place of its own; it takes and returns tensors of the encoder's device."""
         ...

@@ -1,4 +1,4 @@
-"""Files that others may read at any time: written whole or not at all, and told apart by what they hold."""
+"""Files of the graph cache: their names and hashes; each is written whole or not at all, since others may read it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ _EXTERNAL = ".data"
 
 
 def external_data(path: Path) -> Path:
-    """Where the weights of an ONNX file of ours lie that is too large to hold them."""
+    """Return where the weights of an ONNX file lie that is too large to hold them itself."""
     return path.with_name(path.name + _EXTERNAL)
 
 
 def graph_hash(path: Path) -> str:
-    """SHA-256 of an ONNX file and of the weights beside it, hexadecimal.
+    """Compute the SHA-256 of an ONNX file and of the weights beside it, hexadecimal.
 
     Raises:
         OSError: It cannot be read.
@@ -32,12 +32,12 @@ def graph_hash(path: Path) -> str:
 
 
 def slug(text: str) -> str:
-    """A text as part of a file's name: lower case, and hyphens for all but letters, digits and points."""
+    """Make a text fit for a file's name: lower case, and hyphens for all but letters, digits and points."""
     return re.sub(r"[^a-z0-9.]+", "-", text.lower()).strip("-")
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file that is there whole or not at all; makes the directory.
+    """Write a file whole or not at all; make its directory where it is missing.
 
     Raises:
         OSError: It cannot be written; an earlier file of that name is as it was.

@@ -1,4 +1,4 @@
-"""The graphs of every pair: near torch in each precision, and in its place without the encoders' results changing."""
+"""The graphs of every trio: near torch in each precision, and in its place without the encoders' results changing."""
 
 from __future__ import annotations
 
@@ -10,44 +10,44 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from graph_trios import HEIGHT, PAIRS, WIDTH, boxes
+from graph_trios import HEIGHT, TRIOS, WIDTH, boxes
 
-from fus3dmaps_core.encoders.graphs import GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import GraphEncoder
 from fus3dmaps_core.runtimes.exporting import ExportedGraph, export_graph, graph_encoders
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
 from fus3dmaps_core.runtimes.parity import BOUNDS
 
 KINDS = ("patch", "crop")
 PRODUCTS = ("MatMul", "Gemm", "Conv")
-GRAPHS = [(pair, kind) for pair in PAIRS for kind in KINDS]
+GRAPHS = [(name, kind) for name in TRIOS for kind in KINDS]
 
 
 @pytest.fixture(scope="session")
-def exported(pairs, tmp_path_factory):
-    """Exports a graph once."""
+def exported(trios, tmp_path_factory):
+    """Export a graph once."""
     folder: Path = tmp_path_factory.mktemp("graphs")
 
     @cache
-    def export(pair: str, kind: str, precision: str) -> ExportedGraph:
-        encoder = graph_encoders(pairs[pair])[KINDS.index(kind)]
+    def export(name: str, kind: str, precision: str) -> ExportedGraph:
+        encoder = graph_encoders(trios[name])[KINDS.index(kind)]
         return export_graph(encoder, precision, folder, HEIGHT, WIDTH)
 
     return export
 
 
 def errors(expected: np.ndarray, found: np.ndarray) -> np.ndarray:
-    """1 - cos along the last axis."""
+    """Compute 1 - cos along the last axis."""
     expected, found = expected.astype(np.float64), found.astype(np.float64)
     lengths = np.linalg.norm(expected, axis=-1) * np.linalg.norm(found, axis=-1)
     return 1 - (expected * found).sum(axis=-1) / lengths
 
 
 @pytest.mark.parametrize("precision", ["fp32", "fp16"])
-@pytest.mark.parametrize(("pair", "kind"), GRAPHS)
-def test_a_graph_says_what_torch_says(pairs, exported, rng, pair, kind, precision):
-    found = exported(pair, kind, precision)
-    graph = getattr(pairs[pair], kind).graph(HEIGHT, WIDTH)
-    values = rng.uniform(0, 255, graph.shape) if pair == "lite" else rng.normal(size=graph.shape)
+@pytest.mark.parametrize(("name", "kind"), GRAPHS)
+def test_a_graph_says_what_torch_says(trios, exported, rng, name, kind, precision):
+    found = exported(name, kind, precision)
+    graph = getattr(trios[name], kind).graph(HEIGHT, WIDTH)
+    values = rng.uniform(0, 255, graph.shape) if name == "lite" else rng.normal(size=graph.shape)
     images = values.astype(np.float32)
     session = onnxruntime.InferenceSession(found.path, providers=["CPUExecutionProvider"])
     outputs = session.run(list(graph.outputs), {"images": images})
@@ -65,24 +65,24 @@ def test_a_graph_says_what_torch_says(pairs, exported, rng, pair, kind, precisio
         assert np.abs(one.numpy() - other).max() < bound.further
 
 
-@pytest.mark.parametrize(("pair", "kind"), GRAPHS)
-def test_half_precision_is_below_its_bound_and_rounds(exported, pair, kind):
-    parities = {precision: exported(pair, kind, precision).parity for precision in ("fp32", "fp16", "bf16")}
+@pytest.mark.parametrize(("name", "kind"), GRAPHS)
+def test_half_precision_is_below_its_bound_and_rounds(exported, name, kind):
+    parities = {precision: exported(name, kind, precision).parity for precision in ("fp32", "fp16", "bf16")}
     for precision in ("fp16", "bf16"):
         assert parities[precision].largest < BOUNDS[precision].largest
         assert parities[precision].mean < BOUNDS[precision].mean
         assert parities[precision].mean > 10 * abs(parities["fp32"].mean)
 
 
-@pytest.mark.parametrize(("pair", "kind"), GRAPHS)
-def test_a_file_says_what_it_is_and_has_one_fixed_shape(pairs, exported, pair, kind):
-    found = exported(pair, kind, "fp32")
+@pytest.mark.parametrize(("name", "kind"), GRAPHS)
+def test_a_file_says_what_it_is_and_has_one_fixed_shape(trios, exported, name, kind):
+    found = exported(name, kind, "fp32")
     model = onnx.load(found.path)
     onnx.checker.check_model(model)
-    graph = getattr(pairs[pair], kind).graph(HEIGHT, WIDTH)
+    graph = getattr(trios[name], kind).graph(HEIGHT, WIDTH)
     assert [(opset.domain, opset.version) for opset in model.opset_import if opset.domain == ""] == [("", 18)]
     assert {prop.key: prop.value for prop in model.metadata_props}.items() >= {
-        "model": pair,
+        "model": name,
         "graph": kind,
         "shape": "x".join(map(str, graph.shape)),
         "precision": "fp32",
@@ -95,9 +95,9 @@ def test_a_file_says_what_it_is_and_has_one_fixed_shape(pairs, exported, pair, k
 
 
 @pytest.mark.parametrize(("precision", "half"), [("fp16", onnx.TensorProto.FLOAT16), ("bf16", onnx.TensorProto.BFLOAT16)])
-@pytest.mark.parametrize(("pair", "kind"), GRAPHS)
-def test_products_alone_are_half(exported, pair, kind, precision, half):
-    model = onnx.load(exported(pair, kind, precision).path)
+@pytest.mark.parametrize(("name", "kind"), GRAPHS)
+def test_products_alone_are_half(exported, name, kind, precision, half):
+    model = onnx.load(exported(name, kind, precision).path)
     types = {value.name: value.type.tensor_type.elem_type for value in [*model.graph.value_info, *model.graph.output]}
     types |= {weight.name: weight.data_type for weight in model.graph.initializer}
     products = [node for node in model.graph.node if node.op_type in PRODUCTS]
@@ -113,13 +113,13 @@ def test_products_alone_are_half(exported, pair, kind, precision, half):
         assert value.type.tensor_type.elem_type == onnx.TensorProto.FLOAT
 
 
-@pytest.mark.parametrize("pair", PAIRS)
-def test_encoders_give_the_same_through_the_graph(pairs, exported, picture, pair):
-    trio = pairs[pair]
+@pytest.mark.parametrize("name", TRIOS)
+def test_encoders_give_the_same_through_the_graph(trios, exported, picture, name):
+    trio = trios[name]
     patches, crops = trio.patch.encode_patches(picture), trio.crop.encode_crops(picture, boxes(18))
     try:
         for kind in KINDS:
-            getattr(trio, kind).run_with(OnnxNetwork(exported(pair, kind, "fp32").path, "cpu"))
+            getattr(trio, kind).run_with(OnnxNetwork(exported(name, kind, "fp32").path, "cpu"))
         found = trio.patch.encode_patches(picture)
         assert found.embeddings.dtype == found.weights.dtype == np.float32
         np.testing.assert_allclose(found.embeddings, patches.embeddings, atol=1e-4)

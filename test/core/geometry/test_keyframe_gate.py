@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from reference.gates import keyframes, moved_m, turned_rad
 from scipy.spatial.transform import Rotation
 
-from fus3dmaps_core.geometry.motion import KeyframeGate, rotation_angle_rad
+from fus3dmaps_core.geometry.keyframe_gate import KeyframeGate, rotation_angle_rad
 
 
 def pose(position=(0.0, 0.0, 0.0), rotation_vector=(0.0, 0.0, 0.0)) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The pairs on RADIO with random weights: shapes, spaces, normalisation, plain numbers, and the whole pipeline."""
+"""The trios on RADIO with random weights: shapes, spaces, normalisation, plain numbers, and the whole pipeline."""
 
 from __future__ import annotations
 
@@ -7,19 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from pair_maps import map_with_pooled_patches
 from reference.radio_attention import LAYER_EPSILON, gelu, last_block, layer_norm, neighbourhood, project, recursive
 from stand_ins import ColorSegmenter, wall_frame
+from trio_maps import map_with_pooled_patches
 
 from fus3dmaps_core.answers.query import TextQuery, answer_query
 from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.encoders.radio.loading import load_networks, make_trio
 from fus3dmaps_core.encoders.radio.naradio import NARADIO
-from fus3dmaps_core.encoders.radio.pair import load_networks, make_trio
 from fus3dmaps_core.encoders.radio.radseg import RADSEG
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.pipeline import Pipeline
 
-TEACHER = 1  # The pair's teacher is the second of the checkpoint's, and so is its summary token.
+TEACHER = 1  # The trio's teacher is the second of the checkpoint's, and so is its summary token.
 MEAN, STD = np.array([0.48145466, 0.4578275, 0.40821073]), np.array([0.26862954, 0.26130258, 0.27577711])
 
 
@@ -36,13 +36,13 @@ def unit(values: np.ndarray) -> np.ndarray:
 
 
 def in_file(loaded, prefix: str) -> dict[str, np.ndarray]:
-    """Weights of the checkpoint whose names begin so, under the rest of their names."""
+    """Return the weights of the checkpoint whose names begin so, under the rest of their names."""
     state = torch.load(loaded.checkpoint, weights_only=False)["state_dict"]
     return {name.removeprefix(prefix): value.double().numpy() for name, value in state.items() if name.startswith(prefix)}
 
 
 def head(loaded, features: np.ndarray) -> np.ndarray:
-    """The teacher's head by its weights in the file alone: unit embeddings of (..., width) features."""
+    """Apply the teacher's head by its weights in the file alone: unit embeddings of (..., width) features."""
     weights = in_file(loaded, f"_heads.{TEACHER}.")
 
     def layer(values, name):
@@ -58,7 +58,7 @@ def head(loaded, features: np.ndarray) -> np.ndarray:
 
 
 def into_the_last_block(loaded, rgb: np.ndarray) -> np.ndarray:
-    """Tokens (N, width) that RADIO's own pass over an image brings to its last block."""
+    """Return the tokens (N, width) that RADIO's own pass over an image brings to its last block."""
     seen: list[torch.Tensor] = []
     hook = loaded.radio.model.blocks[-1].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].clone()))
     try:
@@ -87,7 +87,7 @@ def test_every_patch_has_a_unit_embedding_in_the_space_of_text(loaded, rng, size
 
 def test_a_crop_has_radios_own_summary_of_the_image_in_zero_to_one(loaded, rng):
     """RADIO normalises by itself what its authors say it takes; without that, or with it twice, the numbers differ."""
-    side = loaded.pair.crop_px
+    side = loaded.variant.crop_px
     rgb = picture(rng, side, side)
     with torch.inference_mode():
         summaries = loaded.radio(torch.from_numpy(rgb).permute(2, 0, 1)[None] / 255.0)[0]
@@ -98,7 +98,7 @@ def test_a_crop_has_radios_own_summary_of_the_image_in_zero_to_one(loaded, rng):
 
 def test_the_network_is_given_normalised_pixels_once(loaded, rng):
     """What enters the first layer, for patches and crops; a conditioner that was lost or run twice shows here."""
-    side = loaded.pair.crop_px
+    side = loaded.variant.crop_px
     rgb = picture(rng, side, side)
     backbone = loaded.trio.patch.network.backbone
     seen: list[np.ndarray] = []
@@ -125,9 +125,9 @@ def test_without_another_attention_patches_are_radios_own(loaded, rng):
         def forward(self, tokens, rows, columns):
             return self.attention(tokens)
 
-    pair = replace(loaded.pair, attention=Trained)
-    backbone, summary_head = load_networks(pair, str(loaded.folder))
-    trio = make_trio(pair, backbone, summary_head, loaded.trio.text, "cpu", 0.0)
+    variant = replace(loaded.variant, attention=Trained)
+    backbone, summary_head = load_networks(variant, str(loaded.folder))
+    trio = make_trio(variant, backbone, summary_head, loaded.trio.text, "cpu", 0.0)
     rgb = picture(rng, 64, 96)
     with torch.inference_mode():
         features = loaded.radio(torch.from_numpy(rgb).permute(2, 0, 1)[None] / 255.0)[1]
@@ -137,8 +137,8 @@ def test_without_another_attention_patches_are_radios_own(loaded, rng):
     assert np.abs(own - expected).max() > 1e-3
 
 
-def test_patches_are_plain_loops_over_the_last_block_with_the_pairs_attention(loaded, rng):
-    """From the tokens before it to the embeddings, with what the papers say of each pair's attention."""
+def test_patches_are_plain_loops_over_the_last_block_with_the_trios_attention(loaded, rng):
+    """From the tokens before it to the embeddings, with what the papers say of each trio's attention."""
     rows, columns, heads = 4, 9, 3
     rgb = picture(rng, 16 * rows, 16 * columns)
     tokens = into_the_last_block(loaded, rgb)
@@ -147,7 +147,7 @@ def test_patches_are_plain_loops_over_the_last_block_with_the_pairs_attention(lo
         "naradio": lambda values, attention: neighbourhood(values, attention, heads, prefix, rows, columns, sigma=7.0),
         "radseg": lambda values, attention: recursive(values, attention, heads, scale=10.0),
     }
-    values = last_block(tokens, in_file(loaded, "base_model.blocks.2."), attentions[loaded.pair.name])
+    values = last_block(tokens, in_file(loaded, "base_model.blocks.2."), attentions[loaded.variant.name])
     features = layer_norm(values, in_file(loaded, "base_model."), "norm", LAYER_EPSILON)[prefix:]
     normalizer = in_file(loaded, "_feature_normalizer.")
     expected = head(loaded, (features - normalizer["mean"]) @ normalizer["tx"].T).reshape(rows, columns, -1)
@@ -187,8 +187,8 @@ def test_nothing_gives_no_rows(loaded):
 
 
 def test_half_precision_is_near_and_of_unit_length(loaded, rng):
-    backbone, summary_head = load_networks(loaded.pair, str(loaded.folder))
-    trio = make_trio(loaded.pair, backbone, summary_head, loaded.trio.text, "cpu", 0.0, torch.bfloat16)
+    backbone, summary_head = load_networks(loaded.variant, str(loaded.folder))
+    trio = make_trio(loaded.variant, backbone, summary_head, loaded.trio.text, "cpu", 0.0, torch.bfloat16)
     rgb = picture(rng, 64, 96)
     for half, single in (
         (trio.patch.encode_patches(rgb).embeddings, loaded.trio.patch.encode_patches(rgb).embeddings),

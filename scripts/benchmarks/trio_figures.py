@@ -1,4 +1,4 @@
-"""An encoder pair at the size that it has: load it, time it, count it."""
+"""An encoder trio at the size that it has: load it, time it, count it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from benchmarks.model_figures import (
     seconds,
 )
 from fus3dmaps_core.config.schema import ImageConfig
-from fus3dmaps_core.encoders.graphs import Graph, GraphEncoder
+from fus3dmaps_core.encoders.network_graphs import Graph, GraphEncoder
 from fus3dmaps_core.encoders.protocols import EncoderTrio, TextEncoder
 from fus3dmaps_core.encoders.registry import load_trio
 from fus3dmaps_core.masks import Masks
@@ -39,8 +39,8 @@ _CROP_SIDES_PX = (40, 240)
 _SEED = 3
 
 
-def open_pair(job: Job) -> tuple[EncoderTrio, float, float]:
-    """Load a pair and have its networks run as the job says.
+def open_trio(job: Job) -> tuple[EncoderTrio, float, float]:
+    """Load a trio and have its networks run as the job says.
 
     Returns:
         It; seconds of loading; seconds of opening the runtime.
@@ -55,8 +55,8 @@ def open_pair(job: Job) -> tuple[EncoderTrio, float, float]:
     return trio, loaded - started, time.perf_counter() - loaded
 
 
-def measure_pair(job: Job, rgb: NDArray[np.uint8]) -> ModelFigures:
-    """Load a pair and measure it.
+def measure_trio(job: Job, rgb: NDArray[np.uint8]) -> ModelFigures:
+    """Load a trio and measure it.
 
     Args:
         job: What is measured.
@@ -65,11 +65,11 @@ def measure_pair(job: Job, rgb: NDArray[np.uint8]) -> ModelFigures:
     Raises:
         EncoderError: It cannot be loaded, or not run as the job says.
     """
-    return figures_of(job, rgb, *open_pair(job))
+    return figures_of(job, rgb, *open_trio(job))
 
 
 def figures_of(job: Job, rgb: NDArray[np.uint8], trio: EncoderTrio, load_s: float, prepare_s: float) -> ModelFigures:
-    """Measure a pair that is loaded; see :func:`measure_pair`."""
+    """Measure a trio that is loaded; see :func:`measure_trio`."""
     loaded_bytes = resident_bytes("VmRSS")
     patch, crop = (cast(GraphEncoder, encoder).graph(*rgb.shape[:2]) for encoder in (trio.patch, trio.crop))
     frames = [np.roll(rgb, 8 * index, axis=1) for index in range(1 + job.repeats)]  # lite remembers what it has seen
@@ -83,7 +83,7 @@ def figures_of(job: Job, rgb: NDArray[np.uint8], trio: EncoderTrio, load_s: floa
     images, texts = parameters_of([patch.network, crop.network]), parameters_of(modules_in(trio.text))
     detector_parameters, detector_flops = count_detector() if trio.name == "lite" else (0, 0)
     return ModelFigures(
-        kind="pair",
+        kind="trio",
         name=job.name,
         device=job.device,
         runtime=job.runtime,
@@ -117,7 +117,7 @@ def figures_of(job: Job, rgb: NDArray[np.uint8], trio: EncoderTrio, load_s: floa
 
 
 def _time_crops(job: Job, trio: EncoderTrio, rgb: NDArray[np.uint8], batch: int) -> tuple[list[float], int]:
-    """Seconds of batches of crops of a frame whose patches were embedded before, and how many crops are in a batch.
+    """Time batches of crops of a frame whose patches were embedded before; return seconds, and the crops of a batch.
 
     A full batch of the encoder, or fewer where the budget would not do for two of them, unless the runtime pads them.
     """
@@ -143,7 +143,7 @@ def _boxes(count: int, height: int, width: int) -> Masks:
 
 
 def _time_prompt(job: Job, text: TextEncoder) -> tuple[list[float], int, int]:
-    """Seconds of a prompt, the sentences it is put into, and how many of them were timed.
+    """Time a prompt; return seconds, the sentences it is put into, and how many of them were timed.
 
     Where all of them would take longer than the budget a few are timed and the rest is taken to cost as much.
     """

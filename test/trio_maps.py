@@ -1,4 +1,4 @@
-"""Maps of a wall with painted squares by the encoders of a pair: chosen by its name, or with pooled patches."""
+"""Maps of a wall with painted squares by the encoders of a trio: chosen by its name, or with pooled patches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SETTINGS = {"image.width": 224, "image.height": 160, "segmenter.min_area_px": 30
 
 
 def map_by_name(name: str, weights: Path, dimension: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Map three frames with the pair of a name and the weights in a directory; every layer answers."""
+    """Map three frames with the trio of a name and the weights in a directory; every layer answers."""
     monkeypatch.setattr("fus3dmaps_core.pipeline.load_segmenter", lambda *options: ColorSegmenter())
     chosen = {"encoder.name": name, "encoder.weights": str(weights), "fusion.window_radius_m": 6.0}
     pipeline = Pipeline.from_config(Config.from_flat({**SETTINGS, **chosen}))

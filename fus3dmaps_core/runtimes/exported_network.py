@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fus3dmaps_core.config.schema import Precision, Runtime
-from fus3dmaps_core.encoders.graphs import Network
+from fus3dmaps_core.encoders.network_graphs import Network
 from fus3dmaps_core.runtimes.onnx_network import OnnxNetwork
 from fus3dmaps_core.runtimes.tensorrt_network import engine_of
 

@@ -7,14 +7,14 @@ from numpy.typing import NDArray
 
 
 def rotation_angle_rad(R: NDArray[np.float64]) -> float:
-    """Angle of a 3x3 rotation matrix, radians in [0, pi]."""
+    """Compute the angle of a 3x3 rotation matrix, radians in [0, pi]."""
     # atan2 of both parts keeps small angles exact, where arccos of the trace alone loses half its digits.
     sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
     return float(np.arctan2(sine, (np.trace(R) - 1.0) / 2.0))
 
 
 class KeyframeGate:
-    """Lets a pose pass if it moved or turned enough since the last accepted one; the first always passes."""
+    """A gate that a pose passes if it moved or turned enough since the last accepted one; the first always passes."""
 
     def __init__(self, translation_m: float, rotation_rad: float) -> None:
         """Set both thresholds; reaching either of them suffices."""
@@ -23,7 +23,7 @@ class KeyframeGate:
         self._last: NDArray[np.float64] | None = None
 
     def wants(self, T_world_camera: NDArray[np.float64]) -> bool:
-        """Whether the pose would be a keyframe; changes nothing."""
+        """Tell whether the pose would be a keyframe; change nothing."""
         if self._last is None:
             return True
         moved_m = float(np.linalg.norm(T_world_camera[:3, 3] - self._last[:3, 3]))

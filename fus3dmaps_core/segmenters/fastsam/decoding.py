@@ -1,4 +1,4 @@
-"""From the raw outputs of FastSAM to masks: scores, boxes, and the sums of prototypes that YOLACT (Bolya et al. 2019) makes.
+"""From the raw outputs of FastSAM to masks: scores, boxes, and sums of prototypes as in YOLACT (Bolya et al. 2019).
 
 The thresholds are those that FastSAM's authors run it with.
 """
@@ -11,7 +11,7 @@ import torch
 
 from fus3dmaps_core.masks import Masks
 from fus3dmaps_core.segmenters.fastsam.letterbox import Letterbox
-from fus3dmaps_core.segmenters.proposals import best_first, box_overlaps, first_of_overlapping, mask_overlaps, masks_at
+from fus3dmaps_core.segmenters.mask_tensors import best_first, box_overlaps, first_of_overlapping, mask_overlaps, masks_at
 
 PROTOTYPES = 32
 """Masks whose weighted sums are the masks of objects."""
@@ -40,7 +40,7 @@ class Candidates(NamedTuple):
 
 
 def select(predictions: torch.Tensor) -> Candidates:
-    """Confident detections whose boxes do not all but coincide with a better one's.
+    """Select the confident detections whose boxes do not nearly coincide with a better one's.
 
     Args:
         predictions: (37, N): for every anchor centre x, y, width, height in pixels of the input, score in [0, 1], weights of
@@ -57,14 +57,14 @@ def select(predictions: torch.Tensor) -> Candidates:
 
 
 def masks_of(candidates: Candidates, prototypes: torch.Tensor, letterbox: Letterbox, height: int, width: int) -> Masks:
-    """Masks of detections at the image's own size, each cut to its box; of masks that all but coincide the best.
+    """Make masks at the image's own size, each cut to its box; of masks that nearly coincide the best stays.
 
     Args:
         candidates: Detections.
         prototypes: (32, h / 4, w / 4) of an (h, w) input.
         letterbox: Where the image lies in the input.
-        height: Of the image, pixels.
-        width: Of the image, pixels.
+        height: Height of the image, pixels.
+        width: Width of the image, pixels.
     """
     logits = torch.tensordot(candidates.coefficients, prototypes, dims=1)
     kept = first_of_overlapping(mask_overlaps(_coarse(logits, candidates.boxes), MAX_MASK_IOU))
@@ -76,7 +76,7 @@ def masks_of(candidates: Candidates, prototypes: torch.Tensor, letterbox: Letter
 
 
 def _coarse(logits: torch.Tensor, boxes: torch.Tensor) -> torch.Tensor:
-    """(n, h / 4, w / 4) bool masks on the prototypes' grid, of the cells whose centres are in their boxes."""
+    """Make (n, h / 4, w / 4) bool masks on the prototypes' grid, of the cells whose centres are in their boxes."""
     x = (torch.arange(logits.shape[2], device=logits.device) + 0.5) * STRIDE
     y = (torch.arange(logits.shape[1], device=logits.device) + 0.5) * STRIDE
     left, top, right, bottom = boxes[:, :, None].unbind(dim=1)
