@@ -5,11 +5,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fus3dmaps_core.voxel_map.kernels import (
@@ -21,7 +20,7 @@ from fus3dmaps_core.voxel_map.kernels import (
     numba_scan,
 )
 from fus3dmaps_core.voxel_map.kernels.keys import BITS, HALF
-from fus3dmaps_core.voxel_map.kernels.numba_values import FLOAT, stored
+from fus3dmaps_core.voxel_map.kernels.numba_values import stored
 from fus3dmaps_core.voxel_map.kernels.protocols import (
     DELETED,
     EMPTY,
@@ -202,7 +201,7 @@ class CompiledKernels:
         slots, rows, sums_width = len(block.keys), len(hypotheses.id_of_row), 0 if sums is None else asked.prompts + 1
         parts = cuts(slots, _SCAN_SLOTS)
         found, kept = [0] * len(parts), [0] * len(parts)
-        voxels, held = (block.keys.numpy(), block.dense_rows.numpy()), _held(hypotheses)
+        keys, dense_rows, held = block.keys.numpy(), block.dense_rows.numpy(), _held(hypotheses)
         known = [getattr(extents, each).numpy() for each in ("voxels", "counts", "sums", "low", "high")]
         if sums is not None:
             known += [sums.members.numpy(), sums.totals.numpy()]
@@ -221,12 +220,12 @@ class CompiledKernels:
                 self._scratch.lend((most, sums_width), np.int64) as part_sums,
             ):
                 part_of_row.fill(-1)
-                table = (part_of_row, row_of_part, part_extents, part_sums)
-                numbers = (block.first + first, *(each[here] for each in voxels), block.voxel_size_m)
-                results = numba_scan.scan(*numbers, *held, *asked, threshold, *table, *(each[here] for each in room))
-                used, found[number], kept[number] = results
+                voxels = numba_scan.Voxels(block.first + first, keys[here], dense_rows[here], block.voxel_size_m)
+                table = numba_scan.Table(part_of_row, row_of_part, part_extents, part_sums)
+                room_here = numba_scan.Room(*(each[here] for each in room))
+                used, found[number], kept[number] = numba_scan.scan(voxels, held, asked, threshold, table, room_here)
                 with adding:
-                    numba_scan.add_parts(*(each[:used] for each in table[1:]), *known)
+                    numba_scan.add_parts(row_of_part[:used], part_extents[:used], part_sums[:used], *known)
 
         self._workers.run([partial(look, number, *part) for number, part in enumerate(parts)])
         end = 0
@@ -301,37 +300,18 @@ def _shift(table: HashTable) -> int:
     return 65 - len(table.keys).bit_length()
 
 
-def _held(hypotheses: Hypotheses) -> tuple[NDArray[Any], ...]:
-    return hypotheses.held_row.numpy(), hypotheses.held_count.numpy(), hypotheses.id_of_row.numpy()
+def _held(hypotheses: Hypotheses) -> numba_scan.Held:
+    return numba_scan.Held(hypotheses.held_row.numpy(), hypotheses.held_count.numpy(), hypotheses.id_of_row.numpy())
 
 
-class _Asked(NamedTuple):
-    """A layer as the compiled scan takes it; what a layer does not have is empty."""
-
-    layer: int = numba_scan.NOTHING
-    tag: Any = FLOAT
-    size: int = 4
-    addresses: NDArray[np.int64] = np.empty(0, np.int64)
-    shift: int = 0
-    scales: NDArray[np.float32] = np.empty(0, np.float32)
-    weight_of_row: NDArray[np.float32] = np.empty(0, np.float32)
-    own_addresses: NDArray[np.int64] = np.empty(0, np.int64)
-    own_shift: int = 0
-    variance_ratio: np.float32 = np.float32(0)
-    texts: NDArray[np.float32] = np.empty((0, 0), np.float32)
-    prompts: int = 0
-    logit_scale: float = 0.0
-    scores_of_row: NDArray[np.float32] = np.empty((0, 0), np.float32)
-
-
-def _asked(layer: EmbeddedLayer | InheritedLayer | None) -> _Asked:
+def _asked(layer: EmbeddedLayer | InheritedLayer | None) -> numba_scan.Asked:
     if layer is None:
-        return _Asked()
+        return numba_scan.Asked()
     if isinstance(layer, InheritedLayer):
         scores = layer.scores_of_row.numpy()
-        return _Asked(numba_scan.INSTANCES, prompts=scores.shape[1], scores_of_row=scores)
+        return numba_scan.Asked(numba_scan.INSTANCES, prompts=scores.shape[1], scores_of_row=scores)
     tag, size, addresses, shift = stored(layer.pool)
-    asked = _Asked(
+    asked = numba_scan.Asked(
         numba_scan.DENSE,
         tag,
         size,

@@ -1,14 +1,14 @@
 """The compiled pass over voxels: what instances occupy, and how the voxels of a layer compare with texts.
 
-Every voxel is looked at once, a few thousand at a time, so that all that is known of them stays in the processor's cache
-between one loop and the next. Sums over an instance's voxels are kept in registers while neighbours have the same top
+Every voxel is visited once, a few thousand at a time, so that their data stay in the processor's cache from one loop to the
+next. Sums over an instance's voxels are kept in registers while neighbours have the same top
 hypothesis, then in a table of the few instances of these voxels. Loops index by unsigned numbers and name the axes one by
 one, which made them three times as fast.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.voxel_map.kernels.keys import BITS, HALF
 from fus3dmaps_core.voxel_map.kernels.numba_cosines import cosines, fused_cosines
+from fus3dmaps_core.voxel_map.kernels.numba_values import FLOAT
 from fus3dmaps_core.voxel_map.kernels.protocols import SCORE_UNIT
 
 NOTHING, DENSE, FUSED, INSTANCES = 0, 1, 2, 3
@@ -35,6 +36,102 @@ _MASK = (1 << BITS) - 1
 _FAR = np.int64(2**62)
 _SLOTS, _LEAST_SLOTS = 4096, 256  # Looked at together: what is known of them stays in a cache.
 _COSINES = 2**18
+
+
+class Voxels(NamedTuple):
+    """Consecutive slots.
+
+    Attributes:
+        first: Number of the first slot.
+        keys: (n,) keys of the slots, negative where there is no voxel.
+        dense_rows: (n,) dense rows, -1 for none.
+        voxel_size_m: Edge of a voxel, metres.
+    """
+
+    first: int
+    keys: NDArray[np.int64]
+    dense_rows: NDArray[np.int32]
+    voxel_size_m: float
+
+
+class Held(NamedTuple):
+    """Hypotheses of all slots.
+
+    Attributes:
+        rows: (slots, K) rows of the instances, -1 where empty.
+        counts: (slots, K) their counts, 0 where empty.
+        id_of_row: Ids of the instances.
+    """
+
+    rows: NDArray[np.int32]
+    counts: NDArray[np.int32]
+    id_of_row: NDArray[np.int64]
+
+
+class Asked(NamedTuple):
+    """A layer and what it is compared with. What a layer does not have is empty.
+
+    Attributes:
+        layer: NOTHING, or which layer is compared.
+        tag: How dense rows are stored.
+        size: Bytes of a stored value.
+        addresses: Addresses of the dense rows' blocks.
+        shift: log2 of the rows of a block.
+        scales: Scale of each int8 row.
+        weight_of_row: w of each dense row.
+        own_addresses: Addresses of the blocks of the instances' rows, which are float32.
+        own_shift: log2 of the rows of such a block.
+        variance_ratio: lambda.
+        texts: (p + q, d) unit vectors: prompts, then negatives.
+        prompts: p.
+        logit_scale: Factor of cosines where there are negatives.
+        scores_of_row: (rows, p) scores of instances, for the layer INSTANCES.
+    """
+
+    layer: int = NOTHING
+    tag: Any = FLOAT
+    size: int = 4
+    addresses: NDArray[np.int64] = np.empty(0, np.int64)
+    shift: int = 0
+    scales: NDArray[np.float32] = np.empty(0, np.float32)
+    weight_of_row: NDArray[np.float32] = np.empty(0, np.float32)
+    own_addresses: NDArray[np.int64] = np.empty(0, np.int64)
+    own_shift: int = 0
+    variance_ratio: np.float32 = np.float32(0)
+    texts: NDArray[np.float32] = np.empty((0, 0), np.float32)
+    prompts: int = 0
+    logit_scale: float = 0.0
+    scores_of_row: NDArray[np.float32] = np.empty((0, 0), np.float32)
+
+
+class Table(NamedTuple):
+    """What instances occupy of some voxels, and their scores.
+
+    Attributes:
+        part_of_row: (rows,) -1 everywhere before and after a scan.
+        row_of_part: (m,) rows of the instances, m being enough for all that occupy one of the voxels.
+        extents: (m, EXTENT_COLUMNS) what they occupy.
+        sums: (m, p + 1) their voxels' scores in steps of 1 / SCORE_UNIT, and how many voxels have the layer.
+    """
+
+    part_of_row: NDArray[np.int32]
+    row_of_part: NDArray[np.int32]
+    extents: NDArray[np.int64]
+    sums: NDArray[np.int64]
+
+
+class Room(NamedTuple):
+    """Room for the voxels that are kept.
+
+    Attributes:
+        centers_m: (n, 3) centres, metres.
+        best: (n,) best scores.
+        which: (n,) the first prompt that has the best score; (0,) where it is not needed.
+    """
+
+    centers_m: NDArray[np.float32]
+    best: NDArray[np.float32]
+    which: NDArray[np.int32]
 
 
 @njit(**_OPTIONS)
@@ -200,109 +297,57 @@ def _keep(
 
 
 @njit(**_OPTIONS)
-def scan(
-    first: int,
-    keys: NDArray[np.int64],
-    dense_rows: NDArray[np.int32],
-    voxel_size_m: float,
-    held_row: NDArray[np.int32],
-    held_count: NDArray[np.int32],
-    id_of_row: NDArray[np.int64],
-    layer: int,
-    tag: Any,
-    size: int,
-    addresses: NDArray[np.int64],
-    shift: int,
-    scales: NDArray[np.float32],
-    weight_of_row: NDArray[np.float32],
-    own_addresses: NDArray[np.int64],
-    own_shift: int,
-    variance_ratio: np.float32,
-    texts: NDArray[np.float32],
-    prompts: int,
-    logit_scale: float,
-    scores_of_row: NDArray[np.float32],
-    threshold: float,
-    part_of_row: NDArray[np.int32],
-    row_of_part: NDArray[np.int32],
-    extents: NDArray[np.int64],
-    sums: NDArray[np.int64],
-    centers_m: NDArray[np.float32],
-    best: NDArray[np.float32],
-    which: NDArray[np.int32],
-) -> tuple[int, int, int]:
-    """Look at consecutive slots.
+def scan(voxels: Voxels, held: Held, asked: Asked, threshold: float, table: Table, room: Room) -> tuple[int, int, int]:
+    """Scan consecutive slots.
 
     Args:
-        first: Number of the first slot.
-        keys: (n,) keys of the slots, negative where there is no voxel.
-        dense_rows: (n,) dense rows, -1 for none.
-        voxel_size_m: Edge of a voxel, metres.
-        held_row: (slots, K) rows of the hypotheses of all slots, -1 where empty.
-        held_count: (slots, K) their counts, 0 where empty.
-        id_of_row: Ids of instances.
-        layer: NOTHING, or which layer is compared.
-        tag: How dense rows are stored.
-        size: Bytes of a stored value.
-        addresses: Addresses of the dense rows' blocks.
-        shift: log2 of the rows of a block.
-        scales: Scale of each int8 row.
-        weight_of_row: w of each dense row.
-        own_addresses: Addresses of the blocks of the instances' rows, which are float32.
-        own_shift: log2 of the rows of such a block.
-        variance_ratio: lambda.
-        texts: (p + q, d) unit vectors: prompts, then negatives.
-        prompts: p.
-        logit_scale: Factor of cosines where there are negatives.
-        scores_of_row: (rows, p) scores of instances, for the layer INSTANCES.
+        voxels: The slots.
+        held: Hypotheses of all slots.
+        asked: What the voxels are compared with.
         threshold: Voxels that score less are not written; -inf for none.
-        part_of_row: (rows,) -1 everywhere, and again when this returns.
-        row_of_part: (m,) written: rows of the instances that occupy these voxels, m being enough for all of them.
-        extents: (m, 11) written: what they occupy.
-        sums: (m, p + 1) written: their voxels' scores in steps of 1 / SCORE_UNIT, and how many voxels have the layer.
-        centers_m: (n, 3) written from the front: centres of the voxels that are kept.
-        best: (n,) written from the front: their best scores.
-        which: (n,) written from the front: the first prompt that has it; (0,) where nobody asks.
+        table: Written: what instances occupy of these voxels, and their scores.
+        room: Written from the front: the voxels that are kept.
 
     Returns:
         How many instances were written, how many voxels have the layer, and how many of these were kept.
     """
-    texts_or_prompts = max(len(texts), prompts, 1)
-    step = max(min(_SLOTS, _COSINES // texts_or_prompts), _LEAST_SLOTS)
+    texts, prompts = asked.texts, asked.prompts
+    step = max(min(_SLOTS, _COSINES // max(len(texts), prompts, 1)), _LEAST_SLOTS)
     parts = found = kept = 0
-    for begin in range(0, len(keys), step):
-        here, rows = keys[begin : begin + step], dense_rows[begin : begin + step]
+    for begin in range(0, len(voxels.keys), step):
+        here, rows = voxels.keys[begin : begin + step], voxels.dense_rows[begin : begin + step]
         count = len(here)
         top_row, top_count = np.empty(count, np.int32), np.empty(count, np.int32)
-        slots = np.arange(first + begin, first + begin + count)
-        top_hypotheses(slots, held_row, held_count, id_of_row, top_row, top_count)
+        slots = np.arange(voxels.first + begin, voxels.first + begin + count)
+        top_hypotheses(slots, held.rows, held.counts, held.id_of_row, top_row, top_count)
         before = parts
-        parts = _add_extents(here, top_row, top_count, part_of_row, row_of_part, extents, parts)
-        if layer == NOTHING:
+        parts = _add_extents(here, top_row, top_count, table.part_of_row, table.row_of_part, table.extents, parts)
+        if asked.layer == NOTHING:
             continue
-        sums[before:parts] = 0
+        table.sums[before:parts] = 0
         place = np.empty(count + 1, np.int32)
-        picked = place[: _pick(layer, rows, top_row, place)]
-        scores = np.empty((len(picked), len(texts) if layer != INSTANCES else prompts), np.float32)
-        if layer == INSTANCES:
+        picked = place[: _pick(asked.layer, rows, top_row, place)]
+        scores = np.empty((len(picked), len(texts) if asked.layer != INSTANCES else prompts), np.float32)
+        if asked.layer == INSTANCES:
             for i in range(len(picked)):
                 for p in range(prompts):
-                    scores[i, p] = scores_of_row[np.uint32(top_row[picked[i]]), p]
-        elif layer == DENSE:
-            cosines(tag, size, addresses, shift, rows[picked], texts, scores, 0, len(picked))
+                    scores[i, p] = asked.scores_of_row[np.uint32(top_row[picked[i]]), p]
+        elif asked.layer == DENSE:
+            cosines(asked.tag, asked.size, asked.addresses, asked.shift, rows[picked], texts, scores, 0, len(picked))
         else:
-            own = (own_addresses, own_shift, variance_ratio)
-            voxels = (picked, rows, top_row, top_count)
-            fused_cosines(tag, size, addresses, shift, scales, weight_of_row, *own, *voxels, texts, scores)
-        if layer != INSTANCES and prompts < len(texts):
+            pool = (asked.tag, asked.size, asked.addresses, asked.shift, asked.scales, asked.weight_of_row)
+            own = (asked.own_addresses, asked.own_shift, asked.variance_ratio)
+            fused_cosines(*pool, *own, picked, rows, top_row, top_count, texts, scores)
+        if asked.layer != INSTANCES and prompts < len(texts):
             relevancy = np.empty((len(picked), prompts), np.float32)
-            _against_negatives(scores, prompts, logit_scale, relevancy)
+            _against_negatives(scores, prompts, asked.logit_scale, relevancy)
             scores = relevancy
-        _add_scores(scores, picked, top_row, part_of_row, sums)
+        _add_scores(scores, picked, top_row, table.part_of_row, table.sums)
         found += len(picked)
-        kept += _keep(here, voxel_size_m, picked, scores, threshold, centers_m[kept:], best[kept:], which[kept:])
+        rest = (room.centers_m[kept:], room.best[kept:], room.which[kept:])
+        kept += _keep(here, voxels.voxel_size_m, picked, scores, threshold, *rest)
     for part in range(parts):
-        part_of_row[row_of_part[part]] = -1
+        table.part_of_row[table.row_of_part[part]] = -1
     return parts, found, kept
 
 
@@ -319,7 +364,7 @@ def add_parts(
     members: NDArray[np.int64],
     totals: NDArray[np.int64],
 ) -> None:
-    """Add what some voxels say of instances to what is known of all; the last two are left alone where they are empty."""
+    """Add extents and sums of some voxels to those of the whole map. The last two may be empty, for none."""
     for part in range(len(row_of_part)):
         row = row_of_part[part]
         voxels[row] += extents[part, 0]
