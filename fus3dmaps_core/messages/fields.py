@@ -15,21 +15,7 @@ from scipy.spatial.transform import Rotation
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.distortion import Distortion
-from fus3dmaps_core.messages.images import about, check_color, check_depth, decode_color, decode_depth, image_size
-
-__all__ = [
-    "check_color",
-    "check_depth",
-    "decode_color",
-    "decode_depth",
-    "image_size",
-    "stamp_ns",
-    "to_distortion",
-    "to_intrinsics",
-    "to_pose",
-    "transform_from",
-    "transform_of",
-]
+from fus3dmaps_core.messages.images import about
 
 _QUATERNION_TOLERANCE = 1e-2  # Publishers round; farther from unit length is not a rotation but a bug or an unset field.
 

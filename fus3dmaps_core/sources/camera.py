@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
+from fus3dmaps_core.messages.images import check_color, check_depth, image_size
 from fus3dmaps_core.sources.paired import CameraModel, PairedMessages, UnregisteredDepth, check_size
 from fus3dmaps_core.sources.poses import FOREVER_NS, Moment, Mounting, PoseProvider
 from fus3dmaps_core.sources.streams import CameraTopics, InputStream, image_type
@@ -40,8 +41,8 @@ class _Models:
     def add(self, message: Any) -> None:
         self._tally.received[self.topic] += 1
         try:
-            distortion = messages.to_distortion(message, self.topic) if self._rectify else None
-            model = CameraModel(messages.to_intrinsics(message, self.topic), distortion)
+            distortion = fields.to_distortion(message, self.topic) if self._rectify else None
+            model = CameraModel(fields.to_intrinsics(message, self.topic), distortion)
         except FrameError as error:
             self._tally.drop(error)
             return
@@ -52,7 +53,7 @@ class _Models:
             old, new = known.intrinsics, model.intrinsics
             changes = f"from {old} to {new}" if old != new else f"in its lens's distortion, now {distortion}"
             self._tally.drop(FrameError(f"{self.topic}: camera model changed {changes}", reason="intrinsics_changed"))
-        stamp_ns = messages.stamp_ns(message)
+        stamp_ns = fields.stamp_ns(message)
         while self._models and self._models[-1][0] >= stamp_ns:
             self._models.pop()
         self._models.append((stamp_ns, model))
@@ -140,10 +141,10 @@ class CameraPairer:
         topic = self._topics.rgb
         self._tally.received[topic] += 1
         try:
-            messages.check_color(message, topic)
-            model = self._models.at(messages.stamp_ns(message))
+            check_color(message, topic)
+            model = self._models.at(fields.stamp_ns(message))
             if model is not None:
-                check_size(messages.image_size(message, topic), model.intrinsics, topic, self._topics.camera_info)
+                check_size(image_size(message, topic), model.intrinsics, topic, self._topics.camera_info)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
             self._tally.drop(error)
@@ -156,7 +157,7 @@ class CameraPairer:
         topic = self._topics.depth
         self._tally.received[topic] += 1
         try:
-            messages.check_depth(message, topic)
+            check_depth(message, topic)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
             self._tally.drop(error)
@@ -235,11 +236,11 @@ class CameraPairer:
         model = self._model_for(rgb, self._models, final, "rgb")
         if depth is None or model is None or T_body_camera is None:
             return None
-        size = messages.image_size(rgb.message, self._topics.rgb)
+        size = image_size(rgb.message, self._topics.rgb)
         check_size(size, model.intrinsics, self._topics.rgb, self._topics.camera_info)
         unregistered = None
         if self._depth_models is None:
-            self._check_same_view(size, messages.image_size(depth.message, self._topics.depth))
+            self._check_same_view(size, image_size(depth.message, self._topics.depth))
         else:
             unregistered = self._unregistered(depth, self._depth_models, moment, final)
             if unregistered is None:
@@ -288,7 +289,7 @@ class CameraPairer:
         if model is None or T_rgb_depth is None:
             return None
         topic = self._topics.depth
-        check_size(messages.image_size(depth.message, topic), model.intrinsics, topic, models.topic)
+        check_size(image_size(depth.message, topic), model.intrinsics, topic, models.topic)
         return UnregisteredDepth(model, T_rgb_depth)
 
     def _check_same_view(self, rgb_size: tuple[int, int], depth_size: tuple[int, int]) -> None:

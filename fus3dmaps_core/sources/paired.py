@@ -13,7 +13,7 @@ from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.registration import register_depth
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.images import decode_color, decode_depth
 
 
 @dataclass(frozen=True)
@@ -101,8 +101,8 @@ class PairedMessages:
         Raises:
             FrameError: The images or the pose are not usable.
         """
-        rgb = messages.decode_color(self.rgb, self.rgb_topic)
-        depth_m = messages.decode_depth(self.depth, self.depth_topic, image.depth_unit_m)
+        rgb = decode_color(self.rgb, self.rgb_topic)
+        depth_m = decode_depth(self.depth, self.depth_topic, image.depth_unit_m)
         check_size((rgb.shape[1], rgb.shape[0]), self.intrinsics, self.rgb_topic, "its camera_info")
         if self.unregistered is None:
             depth_m = self.model.rectified_depth(depth_m)

@@ -10,7 +10,7 @@ from typing import Any
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.fields import to_pose
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.poses import BufferedPoses, Mounting, PoseProvider, TransformPoses
@@ -128,7 +128,7 @@ class FramePairer:
                     f"{topic}: pose is in frame '{frame}', but parameter 'input.map_frame' is '{self._config.map_frame}'",
                     reason="wrong_frame",
                 )
-            T_world_body = messages.to_pose(message, topic)
+            T_world_body = to_pose(message, topic)
             stamp_ns = self._timeline.advance(topic, message)
         except FrameError as error:
             self.drop(error)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.fields import transform_from
 from fus3dmaps_core.sources.streams import pose_topic
 from fus3dmaps_core.sources.timeline import seconds
 from fus3dmaps_core.sources.transforms import NoTransform, TransformBuffer, TransformGap
@@ -228,6 +228,6 @@ def transform_at(
 def _pose_parameter(name: str, values: list[float], index: int) -> NDArray[np.float64]:
     own = values if len(values) == 7 else values[7 * index : 7 * index + 7]
     try:
-        return messages.transform_from(own)
+        return transform_from(own)
     except FrameError as error:
         raise ConfigError(f"parameter 'input.{name}': {error}") from None

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
 
 _TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours; only another clock or a restart goes back this far.
 
@@ -64,7 +64,7 @@ class Timeline:
         Raises:
             FrameError: Reason ``stamp_backwards`` or ``stamp_repeated``.
         """
-        stamp_ns = messages.stamp_ns(message)
+        stamp_ns = fields.stamp_ns(message)
         last_ns = self.last_ns.get(topic)
         if last_ns is not None and stamp_ns <= last_ns:
             back_s = (last_ns - stamp_ns) / 1e9

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
 
 _KEEP_NS = 10_000_000_000  # As tf2 does: longer than any image waits.
 _TIME_JUMP_NS = 3_000_000_000
@@ -127,7 +127,7 @@ class TransformTree:
             raise FrameError(f"{topic}: transform from '{child}' to '{parent}'")
         if child in self._ancestors(parent):
             raise FrameError(f"{topic}: transform from '{child}' to '{parent}' closes a loop")
-        T_parent_child = messages.transform_of(stamped, topic)
+        T_parent_child = fields.transform_of(stamped, topic)
         if self._parents.get(child) != parent or static != (child in self._static):
             self._moving.pop(child, None)
             self._static.pop(child, None)
@@ -136,7 +136,7 @@ class TransformTree:
             self._static[child] = T_parent_child
             return
         buffer = self._moving.setdefault(child, PoseBuffer(self._max_gap_s))
-        stamp_ns = messages.stamp_ns(stamped)
+        stamp_ns = fields.stamp_ns(stamped)
         if buffer.last_ns is not None and stamp_ns <= buffer.last_ns:
             if buffer.last_ns - stamp_ns <= _TIME_JUMP_NS:
                 return  # Publishers repeat transforms; it is no fault.
