@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_core.health import input_problems as problems
-from fus3dmaps_core.health import mapping_problems
-from fus3dmaps_core.health.input_problems import Level, Offer, Part, Problem, Stream
+from fus3dmaps_core.health import input_problems, mapping_problems
+from fus3dmaps_core.health.input_problems import Level, Offer, Part, Problem
 from fus3dmaps_core.health.mapping_problems import MIB, Latency, MemoryState, Pace
-from fus3dmaps_core.health.recent import SlidingWindow
+from fus3dmaps_core.health.recent_numbers import RecentNumbers
+from fus3dmaps_core.sources.streams import Stream
 
 _STAMPS = 500  # Ten seconds of images at 50 Hz.
 _POSES = 100
@@ -56,7 +56,7 @@ class PartReport:
 
 @dataclass
 class _Arrivals:
-    recent: SlidingWindow
+    recent: RecentNumbers
     last_s: float | None = None
     stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_STAMPS))
     ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=20))
@@ -106,14 +106,14 @@ class Diagnosis:
 
     def _forget(self) -> None:
         self._started_s = self._last_offered_s = self._waiting_since_s = self._clock()
-        self._arrivals = {topic: _Arrivals(SlidingWindow(self._window_s)) for topic in self._streams}
-        self._offered = SlidingWindow(self._window_s)
-        self._mapped = SlidingWindow(self._window_s)
+        self._arrivals = {topic: _Arrivals(RecentNumbers(self._window_s)) for topic in self._streams}
+        self._offered = RecentNumbers(self._window_s)
+        self._mapped = RecentNumbers(self._window_s)
         self._waiting = 0
-        self._stages: dict[str, SlidingWindow] = {}
+        self._stages: dict[str, RecentNumbers] = {}
         self._drops: Counter[str] = Counter()
         self._last_drop: dict[str, str] = {}
-        self._recent_drops: dict[str, SlidingWindow] = {}
+        self._recent_drops: dict[str, RecentNumbers] = {}
         self._camera_problems: dict[str, Problem | None] = {}
         self._depth_problems: dict[str, Problem | None] = {}
         self._poses: deque[tuple[NDArray[np.float64], float]] = deque(maxlen=_POSES)
@@ -162,7 +162,7 @@ class Diagnosis:
             self._waiting_since_s = now_s
             self._waiting = waiting
             for stage, duration_s in durations_s.items():
-                self._stages.setdefault(stage, SlidingWindow(self._window_s)).add(now_s, duration_s)
+                self._stages.setdefault(stage, RecentNumbers(self._window_s)).add(now_s, duration_s)
             if durations_s:
                 self._mapped.add(now_s, sum(durations_s.values()))
 
@@ -178,11 +178,11 @@ class Diagnosis:
         with self._lock:
             self._drops[reason] += number
             self._last_drop[reason] = sentence
-            self._recent_drops.setdefault(reason, SlidingWindow(self._window_s)).add(now_s, number)
+            self._recent_drops.setdefault(reason, RecentNumbers(self._window_s)).add(now_s, number)
 
     def camera(self, topic: str, intrinsics: Intrinsics) -> None:
         """A camera model came or changed."""
-        problem = problems.unlikely_intrinsics(topic, intrinsics)
+        problem = input_problems.unlikely_intrinsics(topic, intrinsics)
         with self._lock:
             self._camera_problems[topic] = problem
 
@@ -204,8 +204,8 @@ class Diagnosis:
             encoding: Encoding of the depth message.
             pose_topic: Where the pose comes from.
         """
-        median_m, spread = problems.depth_statistics(depth_m)
-        problem = problems.unlikely_depth(depth_topic, encoding, median_m)
+        median_m, spread = input_problems.depth_statistics(depth_m)
+        problem = input_problems.unlikely_depth(depth_topic, encoding, median_m)
         with self._lock:
             self._depth_problems[depth_topic] = problem
             self._poses.append((T_world_camera, spread))
@@ -289,7 +289,7 @@ class Diagnosis:
         """How much of the window has passed yet, seconds; never zero."""
         return max(min(self._window_s, now_s - self._started_s), 1e-9)
 
-    def _rate_hz(self, window: SlidingWindow, now_s: float) -> float:
+    def _rate_hz(self, window: RecentNumbers, now_s: float) -> float:
         return len(window.numbers(now_s)) / self._seen_s(now_s)
 
     def _latencies(self, now_s: float) -> dict[str, Latency]:
@@ -319,19 +319,19 @@ class Diagnosis:
             silent_s = now_s - (self._started_s if arrivals.last_s is None else arrivals.last_s)
             offered = None if offers is None else offers.get(topic, ())
             if silent_s >= self._silence_s and not (stream.once and arrivals.last_s is not None):
-                found.append(problems.silence(stream, silent_s, offered))
+                found.append(input_problems.silence(stream, silent_s, offered))
                 continue
             if offered and arrivals.last_s is not None:
-                found.append(problems.partly_unheard(stream, offered))
+                found.append(input_problems.partly_unheard(stream, offered))
             if arrivals.last_s is not None and not stream.once:
                 live[topic] = arrivals
         found += self._stamp_problems(live)
         ages_s = {topic: float(np.median(arrivals.ages_s)) for topic, arrivals in live.items()}
-        found.append(problems.clock_mismatch(ages_s, self._clock_tolerance_s, self._use_sim_time))
+        found.append(input_problems.clock_mismatch(ages_s, self._clock_tolerance_s, self._use_sim_time))
         found += [*self._camera_problems.values(), *self._depth_problems.values()]
         if self._poses:
             poses_4x4, spread = zip(*self._poses, strict=True)
-            found.append(problems.not_optical(np.stack(poses_4x4), np.array(spread), self._pose_topic))
+            found.append(input_problems.not_optical(np.stack(poses_4x4), np.array(spread), self._pose_topic))
         return [problem for problem in found if problem is not None]
 
     def _stamp_problems(self, live: Mapping[str, _Arrivals]) -> list[Problem | None]:
@@ -345,8 +345,8 @@ class Diagnosis:
                 continue
             rgb_ns, other_ns = live[rgb.topic].stamps_ns, live[other.topic].stamps_ns
             if other.role == "depth":
-                found.append(problems.stamp_difference(rgb, other, rgb_ns, other_ns, self._sync_tolerance_s))
-            found.append(problems.lag(rgb, other, rgb_ns[-1], other_ns[-1], self._max_wait_s))
+                found.append(input_problems.stamp_difference(rgb, other, rgb_ns, other_ns, self._sync_tolerance_s))
+            found.append(input_problems.lag(rgb, other, rgb_ns[-1], other_ns[-1], self._max_wait_s))
         return found
 
     def _drop_problems(self, now_s: float) -> list[Problem]:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics
+from fus3dmaps_core.sources.streams import Qos, Stream
 
 Part = Literal["inputs", "mapping", "map", "memory"]
 
@@ -72,35 +73,12 @@ class Offer:
     durability: str
 
 
-@dataclass(frozen=True)
-class Stream:
-    """An input of the map.
-
-    Attributes:
-        topic: Its name, as messages and sentences give it.
-        role: What it carries.
-        reliability: What the subscription asks for: ``RELIABLE``, ``BEST_EFFORT`` or ``BEST_AVAILABLE``.
-        durability: What the subscription asks for: ``TRANSIENT_LOCAL``, ``VOLATILE`` or ``BEST_AVAILABLE``.
-        topic_parameter: Parameter that names the topic.
-        qos_parameter: Parameter that chooses its QoS profile.
-        once: One message is enough, as for a latched camera model: only its absence from the start is a problem.
-    """
-
-    topic: str
-    role: Literal["rgb", "depth", "pose", "camera_info"]
-    reliability: str
-    durability: str
-    topic_parameter: str
-    qos_parameter: str
-    once: bool = False
-
-
-def unheard(stream: Stream, offer: Offer) -> str:
-    """Why the subscription does not hear a publisher, by the rules of DDS; empty where it does."""
+def unheard(asked: Qos, offer: Offer) -> str:
+    """Say why a subscription does not hear a publisher, by the rules of DDS; empty where it does."""
     reasons = []
-    if stream.reliability == "RELIABLE" and offer.reliability == "BEST_EFFORT":
+    if asked.reliability == "RELIABLE" and offer.reliability == "BEST_EFFORT":
         reasons.append("offers BEST_EFFORT, we ask RELIABLE")
-    if stream.durability == "TRANSIENT_LOCAL" and offer.durability == "VOLATILE":
+    if asked.durability == "TRANSIENT_LOCAL" and offer.durability == "VOLATILE":
         reasons.append("offers VOLATILE, we ask TRANSIENT_LOCAL")
     return " and ".join(reasons)
 
@@ -117,9 +95,9 @@ def silence(stream: Stream, silent_s: float, offers: Sequence[Offer] | None) -> 
     if offers is None:
         return Problem("inputs", Level.ERROR, "silence", symptom)
     if not offers:
-        sentence = f"{symptom}: it has no publisher. Does the driver run, and is '{stream.topic_parameter}' the right name?"
+        sentence = f"{symptom}: it has no publisher. Does the driver run, and is '{stream.parameter}' the right name?"
         return Problem("inputs", Level.ERROR, "no_publisher", sentence)
-    reasons = [unheard(stream, offer) for offer in offers]
+    reasons = [unheard(stream.qos, offer) for offer in offers]
     if all(reasons):
         who = "its publisher" if len(offers) == 1 else f"the first of its {len(offers)} publishers"
         sentence = f"{symptom}; {who} {reasons[0]}: set parameter '{stream.qos_parameter}' to best_available or sensor_data"
@@ -134,7 +112,7 @@ def silence(stream: Stream, silent_s: float, offers: Sequence[Offer] | None) -> 
 
 def partly_unheard(stream: Stream, offers: Sequence[Offer]) -> Problem | None:
     """Messages come, but not from every publisher of the topic."""
-    deaf = [(offer, reason) for offer in offers if (reason := unheard(stream, offer))]
+    deaf = [(offer, reason) for offer in offers if (reason := unheard(stream.qos, offer))]
     if not deaf:
         return None
     offer, reason = deaf[0]

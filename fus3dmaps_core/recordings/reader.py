@@ -15,10 +15,10 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from fus3dmaps_core.errors import RecordingError
+from fus3dmaps_core.recordings.recorded_files import RawMessage, RecordedFiles, TopicSummary
 from fus3dmaps_core.recordings.salvage import SalvagedMcap
-from fus3dmaps_core.recordings.storage import RawMessage, Storage, TopicSummary
 
-_STORAGE_SUFFIXES = (".mcap", ".db3")
+_SUFFIXES = (".mcap", ".db3")
 
 
 class RecordingReader:
@@ -42,7 +42,7 @@ class RecordingReader:
         self.damage: str | None = None
         if not path.exists():
             raise RecordingError(f"recording '{path}' does not exist")
-        self._storages = self._open()
+        self._parts = self._open()
         if self.message_count == 0:
             self.close()
             raise RecordingError(f"recording '{path}' holds no messages" + (f": {self.damage}" if self.damage else ""))
@@ -51,8 +51,8 @@ class RecordingReader:
     def topics(self) -> dict[str, TopicSummary]:
         """What the recording holds, by topic."""
         merged: dict[str, TopicSummary] = {}
-        for storage in self._storages:
-            for topic, summary in storage.topics.items():
+        for part in self._parts:
+            for topic, summary in part.topics.items():
                 known = merged.get(topic)
                 merged[topic] = summary if known is None else replace(known, count=known.count + summary.count)
         return dict(sorted(merged.items()))
@@ -60,17 +60,17 @@ class RecordingReader:
     @property
     def message_count(self) -> int:
         """Number of messages on all topics; of a damaged file, those that can be read."""
-        return sum(summary.count for storage in self._storages for summary in storage.topics.values())
+        return sum(summary.count for part in self._parts for summary in part.topics.values())
 
     @property
     def start_ns(self) -> int:
         """Earliest time of recording, nanoseconds."""
-        return min(storage.start_ns for storage in self._storages)
+        return min(part.start_ns for part in self._parts)
 
     @property
     def end_ns(self) -> int:
         """Latest time of recording, nanoseconds."""
-        return max(storage.end_ns for storage in self._storages)
+        return max(part.end_ns for part in self._parts)
 
     @property
     def duration_s(self) -> float:
@@ -84,8 +84,8 @@ class RecordingReader:
             RecordingError: After everything readable was delivered, if the recording is damaged.
         """
         count = 0
-        for storage in self._storages:
-            iterator = storage.messages(topics)
+        for part in self._parts:
+            iterator = part.messages(topics)
             while True:
                 try:
                     message = next(iterator, None)
@@ -117,9 +117,9 @@ class RecordingReader:
 
     def close(self) -> None:
         """Release the files."""
-        for storage in self._storages:
-            storage.close()
-        self._storages = []
+        for part in self._parts:
+            part.close()
+        self._parts = []
 
     def __enter__(self) -> RecordingReader:
         """Nothing to do: the recording is open already."""
@@ -131,36 +131,36 @@ class RecordingReader:
         """Release the files."""
         self.close()
 
-    def _open(self) -> list[Storage]:
+    def _open(self) -> list[RecordedFiles]:
         if self.path.is_file():
-            if self.path.suffix not in _STORAGE_SUFFIXES:
+            if self.path.suffix not in _SUFFIXES:
                 raise RecordingError(f"recording '{self.path}' is neither a directory nor a .mcap or .db3 file")
             return [self._open_file(self.path)]
         if (self.path / "metadata.yaml").exists():
             try:
-                return [_IndexedStorage(self.path)]
+                return [_IndexedFiles(self.path)]
             except Exception as error:
                 self.damage = _reason(error)
-        files = sorted((p for p in self.path.iterdir() if p.suffix in _STORAGE_SUFFIXES), key=_natural_order)
+        files = sorted((p for p in self.path.iterdir() if p.suffix in _SUFFIXES), key=_natural_order)
         if not files:
             raise RecordingError(
                 f"recording '{self.path}' cannot be read: {self.damage}"
                 if self.damage
                 else f"directory '{self.path}' is not a recording: it holds no metadata.yaml, .mcap or .db3 file"
             )
-        storages: list[Storage] = []
+        parts: list[RecordedFiles] = []
         for file in files:
             try:
-                storages.append(self._open_file(file))
+                parts.append(self._open_file(file))
             except RecordingError as error:
                 self.damage = self.damage or str(error)
-        if not storages:
+        if not parts:
             raise RecordingError(f"recording '{self.path}' cannot be read: {self.damage}")
-        return storages
+        return parts
 
-    def _open_file(self, path: Path) -> Storage:
+    def _open_file(self, path: Path) -> RecordedFiles:
         try:
-            return _IndexedStorage(path)
+            return _IndexedFiles(path)
         except Exception as error:
             reason = _reason(error)
             if path.suffix == ".mcap":
@@ -171,7 +171,7 @@ class RecordingReader:
             raise RecordingError(f"recording '{path}' cannot be read: {reason}") from error
 
 
-class _IndexedStorage:
+class _IndexedFiles:
     """What rosbags can open: a directory with metadata, or a complete file."""
 
     def __init__(self, path: Path) -> None:

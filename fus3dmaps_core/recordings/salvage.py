@@ -9,7 +9,7 @@ from pathlib import Path
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from fus3dmaps_core.recordings.storage import RawMessage, TopicSummary
+from fus3dmaps_core.recordings.recorded_files import RawMessage, TopicSummary
 
 
 class SalvagedMcap:

@@ -10,9 +10,9 @@ from typing import Any
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
-from fus3dmaps_core.recordings.storage import TopicSummary
+from fus3dmaps_core.recordings.recorded_files import TopicSummary
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
-from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_core.sources.streams import Stream, uses_tf
 from fus3dmaps_core.sources.transforms import TransformTree
 
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
@@ -44,12 +44,12 @@ class BagSource:
         self.messages_read = 0
         self._reader = RecordingReader(path)
         try:
-            inputs = [(stream.parameter, self._require(stream)) for stream in self.pairer.streams()]
+            inputs = [(stream.role, self._require(stream)) for stream in self.pairer.streams()]
             transforms = self._require_tf() if uses_tf(config) else []
         except RecordingError:
             self._reader.close()
             raise
-        self._frames = sum(found.count for parameter, found in inputs if parameter == "input.rgb_topic")
+        self._frames = sum(found.count for role, found in inputs if role == "rgb")
         self.messages_total = sum(found.count for found in [*(found for _, found in inputs), *transforms])
 
     def __len__(self) -> int:
@@ -115,7 +115,7 @@ class BagSource:
             add |= {topic: _transform_adder(tree, pairer, topic) for topic in _TF_TOPICS}
         return pairer, add
 
-    def _require(self, stream: InputStream) -> TopicSummary:
+    def _require(self, stream: Stream) -> TopicSummary:
         topic, msgtype = _absolute(stream.topic), stream.msgtype
         found = self._reader.topics.get(topic)
         if found is not None and found.msgtype == msgtype and found.count > 0:

@@ -13,7 +13,7 @@ from fus3dmaps_core.messages import fields
 from fus3dmaps_core.messages.images import check_color, check_depth, image_size
 from fus3dmaps_core.sources.paired import CameraModel, PairedMessages, UnregisteredDepth, check_size
 from fus3dmaps_core.sources.poses import FOREVER_NS, Moment, Mounting, PoseProvider
-from fus3dmaps_core.sources.streams import CameraTopics, InputStream, image_type
+from fus3dmaps_core.sources.streams import CameraTopics, Stream, image_type
 from fus3dmaps_core.sources.timeline import Tally, Timeline, seconds
 
 _ASPECT_TOLERANCE = 0.01
@@ -124,17 +124,18 @@ class CameraPairer:
         """Stamp of the oldest colour image that waits."""
         return self._rgb[0].stamp_ns if self._rgb else None
 
-    def streams(self) -> Iterator[InputStream]:
-        """The topics of this camera."""
+    def streams(self) -> Iterator[Stream]:
+        """Yield the topics of this camera."""
         config, topics = self._config, self._topics
         info_type, info_qos = "sensor_msgs/msg/CameraInfo", config.camera_info_qos
         rgb_type, depth_type = image_type(config.rgb_transport), image_type(config.depth_transport)
-        yield InputStream(topics.rgb, rgb_type, "input.rgb_topic", config.rgb_qos, self.add_rgb)
-        yield InputStream(topics.depth, depth_type, "input.depth_topic", config.depth_qos, self.add_depth)
-        yield InputStream(topics.camera_info, info_type, "input.camera_info_topic", info_qos, self.add_camera_info)
-        if self._depth_models is not None:
-            name = self._depth_models.topic
-            yield InputStream(name, info_type, "input.depth_camera_info_topic", info_qos, self.add_depth_camera_info)
+        yield Stream(topics.rgb, "rgb", rgb_type, "input.rgb_topic", config.rgb_qos, self.add_rgb)
+        yield Stream(topics.depth, "depth", depth_type, "input.depth_topic", config.depth_qos, self.add_depth)
+        parameter = "input.camera_info_topic"
+        yield Stream(topics.camera_info, "camera_info", info_type, parameter, info_qos, self.add_camera_info)
+        if topics.depth_camera_info is not None:
+            parameter, add = "input.depth_camera_info_topic", self.add_depth_camera_info
+            yield Stream(topics.depth_camera_info, "camera_info", info_type, parameter, info_qos, add)
 
     def add_rgb(self, message: Any) -> None:
         """Take a colour image (``sensor_msgs/Image`` or ``CompressedImage``)."""

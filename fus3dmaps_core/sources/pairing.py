@@ -14,7 +14,7 @@ from fus3dmaps_core.messages.fields import to_pose
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.poses import BufferedPoses, Mounting, PoseProvider, TransformPoses
-from fus3dmaps_core.sources.streams import InputStream, camera_topics, pose_parameter, pose_topic, pose_type, uses_tf
+from fus3dmaps_core.sources.streams import Stream, camera_topics, pose_parameter, pose_topic, pose_type, uses_tf
 from fus3dmaps_core.sources.timeline import Tally, Timeline
 from fus3dmaps_core.sources.transforms import TransformBuffer
 
@@ -88,13 +88,14 @@ class FramePairer:
         """Messages that are kept: images that wait, and poses."""
         return sum(camera.waiting for camera in self._cameras) + len(self._buffered) + len(self._held)
 
-    def streams(self) -> list[InputStream]:
+    def streams(self) -> list[Stream]:
         """Every topic to listen to, but for TF: those of the cameras, then the poses."""
         streams = [stream for camera in self._cameras for stream in camera.streams()]
         msgtype = pose_type(self._config)
         if msgtype is not None:
             parameter = f"input.{pose_parameter(self._config)}"
-            streams.append(InputStream(pose_topic(self._config), msgtype, parameter, self._config.pose_qos, self.add_pose))
+            topic, profile = pose_topic(self._config), self._config.pose_qos
+            streams.append(Stream(topic, "pose", msgtype, parameter, profile, self.add_pose))
         return streams
 
     def add_rgb(self, message: Any, camera: int = 0) -> None:

@@ -1,10 +1,10 @@
-"""Which topics the inputs come on, of which message type, and where their messages go, live and recorded alike."""
+"""The input topics of the map: their names, message types and QoS, the same for the live node and for recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from fus3dmaps_core.config.input import InputConfig, QosProfile
 
@@ -15,23 +15,60 @@ _POSE_TYPES = {
 }
 
 
+class Qos(NamedTuple):
+    """What a subscription asks of publishers, by ROS's names.
+
+    Attributes:
+        reliability: ``RELIABLE``, ``BEST_EFFORT`` or ``BEST_AVAILABLE``.
+        durability: ``TRANSIENT_LOCAL``, ``VOLATILE`` or ``BEST_AVAILABLE``.
+    """
+
+    reliability: str
+    durability: str
+
+
+QOS_PROFILES: dict[QosProfile, Qos] = {
+    "sensor_data": Qos("BEST_EFFORT", "VOLATILE"),
+    "reliable": Qos("RELIABLE", "VOLATILE"),
+    "transient_local": Qos("RELIABLE", "TRANSIENT_LOCAL"),
+    "best_available": Qos("BEST_AVAILABLE", "BEST_AVAILABLE"),
+}
+
+
 @dataclass(frozen=True)
-class InputStream:
-    """One topic that is listened to.
+class Stream:
+    """One input topic of the map.
 
     Attributes:
         topic: Its name as configured, with camera and transport.
+        role: What its messages are.
         msgtype: Message type, e.g. ``sensor_msgs/msg/Image``.
         parameter: Key of the parameter that names the topic.
-        qos: Profile by which it is subscribed to.
+        profile: QoS profile of the subscription.
         add: Takes a message.
     """
 
     topic: str
+    role: Literal["rgb", "depth", "pose", "camera_info"]
     msgtype: str
     parameter: str
-    qos: QosProfile
+    profile: QosProfile
     add: Callable[[Any], None]
+
+    @property
+    def qos(self) -> Qos:
+        """What the profile asks of publishers."""
+        return QOS_PROFILES[self.profile]
+
+    @property
+    def qos_parameter(self) -> str:
+        """Key of the parameter that chooses the profile."""
+        return f"input.{self.role}_qos"
+
+    @property
+    def once(self) -> bool:
+        """Whether one message is enough, as for a latched camera model: silence after it is no problem."""
+        return self.role == "camera_info"
 
 
 @dataclass(frozen=True)

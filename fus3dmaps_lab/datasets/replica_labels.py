@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import read_json
+from fus3dmaps_lab.datasets.checked_files import read_json
 from fus3dmaps_lab.datasets.ply import read_ply
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 from fus3dmaps_lab.datasets.sequence import lookup_table

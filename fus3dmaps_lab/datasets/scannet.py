@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
     image_size,

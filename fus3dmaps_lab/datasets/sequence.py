@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import ConfigError, FrameError, RecordingError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_lab.datasets.files import read_ids, read_rgb
+from fus3dmaps_lab.datasets.checked_files import read_ids, read_rgb
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 
 

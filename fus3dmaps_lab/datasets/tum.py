@@ -12,7 +12,7 @@ from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     image_size,
     read_depth,
     read_rgb,

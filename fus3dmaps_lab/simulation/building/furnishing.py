@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_lab.simulation.building import catalogue as c
+from fus3dmaps_lab.simulation.building import things as t
 from fus3dmaps_lab.simulation.building.box_world import BoxWorldBuilder, Piece, Pose
-from fus3dmaps_lab.simulation.building.catalogue import Maker, Rng, Thing
+from fus3dmaps_lab.simulation.building.things import Maker, Rng, Thing
 
 _GAP_M = 0.06
 _ATTEMPTS = 40
@@ -36,35 +36,35 @@ class RoomKind:
 KINDS = (
     RoomKind(
         "living room",
-        (c.sofa, c.cabinet, c.armchair, c.bookshelf, c.table, c.floor_lamp, c.plant, c.stool),
-        (c.television, c.vase, c.book, c.mug, c.bowl, c.table_lamp),
-        (c.pillow, c.pillow),
+        (t.sofa, t.cabinet, t.armchair, t.bookshelf, t.table, t.floor_lamp, t.plant, t.stool),
+        (t.television, t.vase, t.book, t.mug, t.bowl, t.table_lamp),
+        (t.pillow, t.pillow),
     ),
     RoomKind(
         "bedroom",
-        (c.bed, c.wardrobe, c.nightstand, c.desk, c.chair, c.floor_lamp, c.plant),
-        (c.table_lamp, c.book, c.mug, c.vase, c.monitor),
-        (c.pillow, c.pillow),
+        (t.bed, t.wardrobe, t.nightstand, t.desk, t.chair, t.floor_lamp, t.plant),
+        (t.table_lamp, t.book, t.mug, t.vase, t.monitor),
+        (t.pillow, t.pillow),
     ),
     RoomKind(
         "kitchen",
-        (c.counter, c.oven, c.refrigerator, c.counter, c.table, c.chair, c.chair, c.trash_can, c.sink),
-        (c.microwave, c.kettle, c.bowl, c.bottle, c.mug, c.mug, c.vase),
+        (t.counter, t.oven, t.refrigerator, t.counter, t.table, t.chair, t.chair, t.trash_can, t.sink),
+        (t.microwave, t.kettle, t.bowl, t.bottle, t.mug, t.mug, t.vase),
     ),
     RoomKind(
         "office",
-        (c.desk, c.chair, c.desk, c.chair, c.bookshelf, c.cabinet, c.plant, c.trash_can),
-        (c.monitor, c.keyboard, c.mug, c.book, c.table_lamp, c.bottle),
+        (t.desk, t.chair, t.desk, t.chair, t.bookshelf, t.cabinet, t.plant, t.trash_can),
+        (t.monitor, t.keyboard, t.mug, t.book, t.table_lamp, t.bottle),
     ),
     RoomKind(
         "bathroom",
-        (c.bathtub, c.toilet, c.sink, c.washing_machine, c.cabinet, c.trash_can, c.stool),
-        (c.towel, c.bottle, c.vase, c.towel),
+        (t.bathtub, t.toilet, t.sink, t.washing_machine, t.cabinet, t.trash_can, t.stool),
+        (t.towel, t.bottle, t.vase, t.towel),
     ),
     RoomKind(
         "storage",
-        (c.bookshelf, c.wardrobe, c.box, c.box, c.table, c.box, c.stool, c.box),
-        (c.bottle, c.book, c.bowl, c.towel),
+        (t.bookshelf, t.wardrobe, t.box, t.box, t.table, t.box, t.stool, t.box),
+        (t.bottle, t.book, t.bowl, t.towel),
     ),
 )
 
@@ -103,9 +103,9 @@ def furnish(builder: BoxWorldBuilder, kind: RoomKind, space: Space, rng: Rng) ->
             _fill_shelves(builder, pose, rng)
     taken += [*space.windows_m]
     for _ in range(2):
-        _hang(builder, c.picture(rng), space, taken, rng)
+        _hang(builder, t.picture(rng), space, taken, rng)
     center = 0.5 * (space.low_m + space.high_m)
-    rug = c.rug(rng)
+    rug = t.rug(rng)
     builder.add(rug.class_name, rug.pieces, Pose((float(center[0]), float(center[1]) + 0.65, float(space.low_m[2]))))
 
 
@@ -170,13 +170,13 @@ def _cushion(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequenc
 
 def _fill_shelves(builder: BoxWorldBuilder, pose: Pose, rng: Rng) -> None:
     """A row of books on every board: one instance each row, its books the parts."""
-    for z in c.SHELF_HEIGHTS_M:
+    for z in t.SHELF_HEIGHTS_M:
         pieces: list[Piece] = []
         x, end = -0.45, float(rng.uniform(-0.1, 0.42))
         while x < end:
             thick, tall = float(rng.uniform(0.03, 0.06)), float(rng.uniform(0.22, 0.36))
             low, high = (x, -0.26, z + 0.03), (x + thick, -0.04, z + 0.03 + tall)
-            pieces.append(Piece(f"book {len(pieces)}", low, high, c.book(rng).pieces[0].color))
+            pieces.append(Piece(f"book {len(pieces)}", low, high, t.book(rng).pieces[0].color))
             x += thick + 0.002
         builder.add("books", pieces, pose)
 

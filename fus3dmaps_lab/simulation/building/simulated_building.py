@@ -11,7 +11,6 @@ from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_lab.simulation.building.box_renderer import BoxRenderer
 from fus3dmaps_lab.simulation.building.box_surfaces import surface_points
 from fus3dmaps_lab.simulation.building.box_world import BoxWorld, BoxWorldBuilder
-from fus3dmaps_lab.simulation.building.building_route import route, way_zone_m
 from fus3dmaps_lab.simulation.building.floor_plan import (
     BACKGROUND,
     FloorPlan,
@@ -21,6 +20,7 @@ from fus3dmaps_lab.simulation.building.floor_plan import (
     window_zone_m,
 )
 from fus3dmaps_lab.simulation.building.furnishing import KINDS, Space, furnish
+from fus3dmaps_lab.simulation.building.route import route, way_zone_m
 from fus3dmaps_lab.simulation.depth_noise import DepthSensor
 from fus3dmaps_lab.simulation.drift import Drift
 from fus3dmaps_lab.simulation.truth import LabelledFrame, SurfacePoints, Truth

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from fus3dmaps_lab.simulation.building.building_route import STEP_M, STEP_RAD
 from fus3dmaps_lab.simulation.building.floor_plan import STOREY_M
+from fus3dmaps_lab.simulation.building.route import STEP_M, STEP_RAD
 from fus3dmaps_lab.simulation.building.simulated_building import SimulatedBuilding
 from fus3dmaps_lab.simulation.drift import Drift
 

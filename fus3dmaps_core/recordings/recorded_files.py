@@ -32,7 +32,7 @@ class TopicSummary:
     count: int
 
 
-class Storage(Protocol):
+class RecordedFiles(Protocol):
     """One opened file, or a directory of files with an index."""
 
     @property

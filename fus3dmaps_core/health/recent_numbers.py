@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 
-class SlidingWindow:
+class RecentNumbers:
     """Keeps the numbers that came within a span of time. Not thread-safe: callers hold a lock."""
 
     def __init__(self, length_s: float) -> None:
