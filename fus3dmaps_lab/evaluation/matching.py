@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.voxel_map.kernels.keys import pack
-from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth
 
 _BLOCK_ROWS = 2**14
 _SPARE = 8  # Neighbours asked for beyond k, so that most ties at the last place are seen at once.
@@ -63,34 +62,6 @@ def nearest_voxels(
     return Neighbours(places, np.sqrt(squares) / 2)
 
 
-def match_predictions(
-    truth_keys: NDArray[np.number],
-    predicted_keys: NDArray[np.integer],
-    predicted_classes: NDArray[np.integer],
-    k: int = 5,
-) -> NDArray[np.int32]:
-    """Predicted class of each voxel of the truth.
-
-    Args:
-        truth_keys: (n, 3) voxel indices on the map's grid, or half numbers where the truth's voxels lie between
-            (:attr:`VoxelTruth.positions`).
-        predicted_keys: (m, 3) voxel indices of the map, all different.
-        predicted_classes: (m,) class of each, 0 for none.
-        k: The class is the mode of that many nearest voxels, however far they are; 0 takes the very same voxel.
-
-    Returns:
-        (n,) int32; 0 where the prediction is none, or missing.
-
-    Raises:
-        MapError: With k = 0 the truth is not on the map's grid.
-    """
-    if k == 0:
-        same = same_voxels(truth_keys, predicted_keys)
-        classes = np.append(np.asarray(predicted_classes, np.int32), np.int32(0))
-        return classes[same]
-    return mode_of_neighbours(nearest_voxels(truth_keys, predicted_keys, k), predicted_classes)
-
-
 def mode_of_neighbours(neighbours: Neighbours, predicted_classes: NDArray[np.integer]) -> NDArray[np.int32]:
     """The most frequent class among the neighbours, none (0) being one like any other; ties: the lowest number.
 
@@ -115,19 +86,6 @@ def mode_of_neighbours(neighbours: Neighbours, predicted_classes: NDArray[np.int
         # Sorted, so that the first of the most frequent is the lowest.
         mode[rows] = classes[np.arange(len(classes)), frequency.argmax(axis=1)]
     return mode
-
-
-def seen_truth(truth: VoxelTruth, seen_keys: NDArray[np.integer], reach_voxels: float = 2.0) -> VoxelTruth:
-    """The part of a truth that a map can know of, where the truth has more than was ever seen.
-
-    Args:
-        truth: Of everything.
-        seen_keys: (m, 3) voxel indices of a map that has seen all that there was to see, all different.
-        reach_voxels: How far a voxel of the truth may be from the nearest of these, in voxels.
-    """
-    near = nearest_voxels(truth.positions, seen_keys, 1)
-    kept = np.any(near.distances <= reach_voxels, axis=1)
-    return replace(truth, keys=truth.keys[kept], classes=truth.classes[kept], instances=truth.instances[kept])
 
 
 def same_voxels(positions: NDArray[np.number], predicted_keys: NDArray[np.integer]) -> NDArray[np.int64]:

@@ -20,9 +20,6 @@ SCENES: dict[str, tuple[str, ...]] = {
 }
 """Scenes that the paper averages over, by dataset."""
 
-VARIANCE_RATIOS = {NARADIO: 1.0, CLIP_DINOISER: 5.0}
-"""The lambda that the paper chose for each pair of encoders."""
-
 TABLES = (
     "instance maps",
     "dense maps",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from fus3dmaps_core.errors import StorageError
 
@@ -86,44 +85,3 @@ def write_records(path: Path, records: Iterable[Record]) -> None:
         beside.replace(path)
     except OSError as error:
         raise StorageError(f"{path}: cannot be written: {error}") from None
-
-
-def read_records(path: Path) -> list[Record]:
-    """Read what :func:`write_records` has written.
-
-    Args:
-        path: The file.
-
-    Raises:
-        StorageError: The file is missing or is not such a list; the message names the file and the entry.
-    """
-    try:
-        entries = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise StorageError(f"{path}: cannot be read: {error}") from None
-    except (ValueError, RecursionError) as error:
-        raise StorageError(f"{path}: is not JSON: {error}") from None
-    if not isinstance(entries, list):
-        raise StorageError(f"{path}: must hold a list of records")
-    return [_record(f"{path}: record {number}", entry) for number, entry in enumerate(entries)]
-
-
-def _record(where: str, entry: Any) -> Record:
-    names = [field.name for field in fields(Record)]
-    if not isinstance(entry, dict) or set(entry) != set(names):
-        raise StorageError(f"{where}: must have the keys {', '.join(names)}, and no others")
-    for name in ("scene", "layer", "mode", "metric"):
-        if not isinstance(entry[name], str):
-            raise StorageError(f"{where}: {name} must be a text, got {entry[name]!r}")
-    for name, known in (("layer", LAYERS), ("mode", MODES)):
-        if entry[name] not in known:
-            raise StorageError(f"{where}: {name} must be one of {', '.join(known)}, got '{entry[name]}'")
-    if isinstance(entry["seed"], bool) or not isinstance(entry["seed"], int):
-        raise StorageError(f"{where}: seed must be a whole number, got {entry['seed']!r}")
-    value = entry["value"]
-    if value is None:
-        value = math.nan
-    # Python reads NaN and Infinity too, which are not JSON.
-    elif isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise StorageError(f"{where}: value must be a number or null, got {value!r}")
-    return Record(**(entry | {"value": float(value)}))

@@ -43,11 +43,6 @@ class DepthSensor:
     min_m: float = 0.4
     max_m: float = 8.0
 
-    def sigma_m(self, depth_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Standard deviation of a reading on a surface that faces the camera, metres."""
-        spread_px = float(np.hypot(self.disparity_sigma_px, self.disparity_step_px / np.sqrt(12)))
-        return np.asarray(depth_m, np.float64) ** 2 * (spread_px / self.focal_baseline_m_px)
-
     def measure(
         self, depth_m: NDArray[np.float32], incidence_cos: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.float32]:

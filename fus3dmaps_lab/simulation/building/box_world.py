@@ -34,15 +34,6 @@ class BoxWorld:
     color: NDArray[np.uint8]
     truth: Truth
 
-    def instance_boxes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corners of every instance: two (instances + 1, 3), the first without meaning."""
-        instance = self.truth.instance_of_part[self.part]
-        count = len(self.truth.class_of_instance)
-        low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(low, instance, self.low_m)
-        np.maximum.at(high, instance, self.high_m)
-        return low, high
-
 
 @dataclass(frozen=True)
 class Piece:

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_lab.simulation.building.box_renderer import BoxRenderer
 from fus3dmaps_lab.simulation.building.box_surfaces import surface_points
-from fus3dmaps_lab.simulation.building.box_world import BoxWorld, BoxWorldBuilder
+from fus3dmaps_lab.simulation.building.box_world import BoxWorldBuilder
 from fus3dmaps_lab.simulation.building.floor_plan import (
     BACKGROUND,
-    FloorPlan,
     build_shell,
     door_zone_m,
     plan_building,
@@ -35,7 +34,8 @@ class SimulatedBuilding:
     """A building of one to several storeys and a way through all its rooms: an iterable of labelled frames.
 
     Attributes:
-        truth: Parts, instances and classes.
+        world: Its boxes.
+        plan: Where its rooms are.
         intrinsics: Camera model of every frame.
         rooms: Kind of each room with the lower and upper corner of its inside, metres, in the order of the way.
     """
@@ -72,31 +72,21 @@ class SimulatedBuilding:
             raise ValueError(f"room_size_m must be two ascending numbers from 3.6 m on, got {room_size_m}")
         rng = np.random.default_rng((seed, 0xB01D))
         self._seed = seed
-        self._plan = plan_building(storeys, rooms_per_storey, room_size_m, rng)
+        self.plan = plan_building(storeys, rooms_per_storey, room_size_m, rng)
         builder = BoxWorldBuilder(BACKGROUND)
-        build_shell(builder, self._plan)
+        build_shell(builder, self.plan)
         self.rooms: tuple[tuple[str, NDArray[np.float64], NDArray[np.float64]], ...] = tuple(self._furnish(builder, rng))
-        self._world = builder.build()
-        self._renderer = BoxRenderer(self._world)
+        self.world = builder.build()
+        self._renderer = BoxRenderer(self.world)
         self._sensor = DepthSensor()
-        self._true_poses = _cut(route(self._plan), frames)
+        self._true_poses = _cut(route(self.plan), frames)
         self._poses = self._true_poses if drift is None else drift.believed(self._true_poses)
         self.intrinsics = camera
 
     @property
     def truth(self) -> Truth:
         """Parts, instances and classes."""
-        return self._world.truth
-
-    @property
-    def world(self) -> BoxWorld:
-        """All boxes."""
-        return self._world
-
-    @property
-    def plan(self) -> FloorPlan:
-        """Where the rooms are."""
-        return self._plan
+        return self.world.truth
 
     def __len__(self) -> int:
         """Number of frames."""
@@ -105,10 +95,6 @@ class SimulatedBuilding:
     def __iter__(self) -> Iterator[LabelledFrame]:
         """The frames in order of time."""
         return (self.frame(index) for index in range(len(self)))
-
-    def true_poses(self) -> NDArray[np.float64]:
-        """(n, 4, 4) true poses of the optical frame."""
-        return self._true_poses.copy()
 
     def frame(self, index: int) -> LabelledFrame:
         """A frame; the same whichever frames were asked for before."""
@@ -119,13 +105,13 @@ class SimulatedBuilding:
 
     def surface(self, spacing_m: float = 0.025) -> SurfacePoints:
         """Points of all surfaces that face the inside of the building and touch nothing, seen on the way or not."""
-        return surface_points(self._world, self._plan.insides_m(), spacing_m)
+        return surface_points(self.world, self.plan.insides_m(), spacing_m)
 
     def _furnish(
         self, builder: BoxWorldBuilder, rng: np.random.Generator
     ) -> Iterator[tuple[str, NDArray[np.float64], NDArray[np.float64]]]:
         kinds = rng.permutation(len(KINDS))
-        for number, room in enumerate(self._plan.rooms):
+        for number, room in enumerate(self.plan.rooms):
             kind = KINDS[int(kinds[number % len(KINDS)])]
             reserved = np.concatenate([door_zone_m(room)[None], way_zone_m(room)])
             furnish(builder, kind, Space(room.low_m, room.high_m, reserved, window_zone_m(room)[None]), rng)

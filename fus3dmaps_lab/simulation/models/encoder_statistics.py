@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -106,17 +105,3 @@ class EncoderStatistics:
     def variance_ratio(self) -> float:
         """R^D / R^I, the method's lambda; 1 without noise."""
         return self.patch_variance / self.crop_variance if self.crop_variance > 0 else 1.0
-
-    @property
-    def normalised_variance_ratio(self) -> float:
-        """The lambda that is best for means of *unit* embeddings of one pure signal; 1 without noise.
-
-        In many dimensions |s + n|^2 is close to 1 + R, so a unit embedding holds the signal with a length of
-        (1 + R)^-1/2 and noise of variance R / (1 + R). A sum of one patch and lambda crops then has the highest ratio of
-        signal to noise at lambda = R^D / R^I * sqrt((1 + R^I) / (1 + R^D)). That is R^D / R^I where both are small, and
-        its square root where both are large: normalising gives noisy embeddings a lower weight already.
-
-        It holds for independent observations. The map counts points: those of one patch share its noise, and all points
-        of a mask share that of its crop, while an instance's embedding is a mean over all the frames that saw it.
-        """
-        return self.variance_ratio * math.sqrt((1.0 + self.crop_variance) / (1.0 + self.patch_variance))

@@ -20,7 +20,7 @@ from fus3dmaps_core.errors import MapError, QueryError
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from fus3dmaps_lab.evaluation.evaluate_map import INSTANCE_LAYERS, EvaluationProtocol, evaluate_map
 from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth, voxel_truth
-from fus3dmaps_lab.evaluation.matching import match_predictions
+from fus3dmaps_lab.evaluation.matching import mode_of_neighbours, nearest_voxels
 from fus3dmaps_lab.evaluation.prediction import layer_cosines
 from fus3dmaps_lab.evaluation.records import LAYERS
 from fus3dmaps_lab.evaluation.retrieval import instance_scores
@@ -193,9 +193,9 @@ def judged_plainly(reference, layer, truth, vectors, kept, logit_scale):
     spoken = np.array(kept)[likely.argmax(axis=1)]
     judged = np.isin(truth.classes, kept)
     true = truth.classes[judged]
-    predicted = match_predictions(truth.keys[judged], np.array(keys), spoken, 5)
+    predicted = mode_of_neighbours(nearest_voxels(truth.keys[judged], np.array(keys), 5), spoken)
     options = {"labels": sorted(set(true.tolist())), "zero_division": 0.0}
-    nearest = match_predictions(truth.keys[judged], np.array(keys), np.arange(len(keys)), 1)
+    nearest = nearest_voxels(truth.keys[judged], np.array(keys), 1).places[:, 0]
     confidence, right = likely.max(axis=1)[nearest], spoken[nearest] == true
     bins = np.clip(np.ceil(confidence * 15) - 1, 0, 14)
     return {
