@@ -39,7 +39,6 @@ class _Models:
         self._models: deque[tuple[int, CameraModel]] = deque()
 
     def add(self, message: Any) -> None:
-        self._tally.received[self.topic] += 1
         try:
             distortion = fields.to_distortion(message, self.topic) if self._rectify else None
             model = CameraModel(fields.to_intrinsics(message, self.topic), distortion)
@@ -115,11 +114,6 @@ class CameraPairer:
         self._depth_models = None if topics.depth_camera_info is None else _Models(config, topics.depth_camera_info, tally)
 
     @property
-    def waiting(self) -> int:
-        """Images that wait for their partners."""
-        return len(self._rgb) + len(self._depth)
-
-    @property
     def oldest_ns(self) -> int | None:
         """Stamp of the oldest colour image that waits."""
         return self._rgb[0].stamp_ns if self._rgb else None
@@ -140,7 +134,6 @@ class CameraPairer:
     def add_rgb(self, message: Any) -> None:
         """Take a colour image (``sensor_msgs/Image`` or ``CompressedImage``)."""
         topic = self._topics.rgb
-        self._tally.received[topic] += 1
         try:
             check_color(message, topic)
             model = self._models.at(fields.stamp_ns(message))
@@ -156,7 +149,6 @@ class CameraPairer:
     def add_depth(self, message: Any) -> None:
         """Take a depth image (``sensor_msgs/Image`` or ``CompressedImage``)."""
         topic = self._topics.depth
-        self._tally.received[topic] += 1
         try:
             check_depth(message, topic)
             stamped = _Stamped(self._timeline.advance(topic, message), message)

@@ -24,7 +24,7 @@ __all__ = ["FramePairer", "PairedMessages"]
 class FramePairer:
     """Pairs each colour image with the nearest depth image and the pose at its stamp.
 
-    Feed it through :meth:`streams` or the ``add_`` methods and call :meth:`poll` after each message. Whatever cannot be used
+    Hand it messages through its :meth:`streams` and call :meth:`poll` after each. Whatever cannot be used
     is dropped and counted, never raised. Time is that of the stamps: an image is given up once any input has moved
     ``max_wait_s`` (for a transform: ``tf_timeout_s``) past it, so memory stays bounded by what arrives in that span. A stamp
     that goes back more than three seconds (a looped recording, a restarted simulation) ends what was waiting and pairing
@@ -63,11 +63,6 @@ class FramePairer:
         self._ready: list[PairedMessages] = []
 
     @property
-    def received(self) -> Counter[str]:
-        """Messages per topic, usable or not."""
-        return self._tally.received
-
-    @property
     def drops(self) -> Counter[str]:
         """Messages and colour images that led to no frame, by reason.
 
@@ -83,11 +78,6 @@ class FramePairer:
         """The latest explanation of each reason; names the topic."""
         return self._tally.last_drop
 
-    @property
-    def waiting(self) -> int:
-        """Messages that are kept: images that wait, and poses."""
-        return sum(camera.waiting for camera in self._cameras) + len(self._buffered) + len(self._held)
-
     def streams(self) -> list[Stream]:
         """Every topic to listen to, but for TF: those of the cameras, then the poses."""
         streams = [stream for camera in self._cameras for stream in camera.streams()]
@@ -98,22 +88,6 @@ class FramePairer:
             streams.append(Stream(topic, "pose", msgtype, parameter, profile, self.add_pose))
         return streams
 
-    def add_rgb(self, message: Any, camera: int = 0) -> None:
-        """Take a colour image (``sensor_msgs/Image`` or ``CompressedImage``) of the camera of that number."""
-        self._cameras[camera].add_rgb(message)
-
-    def add_depth(self, message: Any, camera: int = 0) -> None:
-        """Take a depth image (``sensor_msgs/Image`` or ``CompressedImage``)."""
-        self._cameras[camera].add_depth(message)
-
-    def add_camera_info(self, message: Any, camera: int = 0) -> None:
-        """Take the camera model of the colour images (``sensor_msgs/CameraInfo``)."""
-        self._cameras[camera].add_camera_info(message)
-
-    def add_depth_camera_info(self, message: Any, camera: int = 0) -> None:
-        """Take the camera model of depth images that are not registered (``sensor_msgs/CameraInfo``)."""
-        self._cameras[camera].add_depth_camera_info(message)
-
     def add_pose(self, message: Any) -> None:
         """Take a pose of the body in the map frame.
 
@@ -121,7 +95,6 @@ class FramePairer:
             message: ``geometry_msgs/PoseStamped``, ``PoseWithCovarianceStamped`` or ``nav_msgs/Odometry``.
         """
         topic = pose_topic(self._config)
-        self._tally.received[topic] += 1
         frame = message.header.frame_id
         try:
             if frame.lstrip("/") != self._config.map_frame.lstrip("/"):

@@ -87,10 +87,6 @@ class BufferedPoses:
         self._buffer = PoseBuffer(config.max_pose_gap_s)
         self.child_frame = ""
 
-    def __len__(self) -> int:
-        """Number of poses held."""
-        return len(self._buffer)
-
     def add(self, stamp_ns: int, T_world_body: NDArray[np.float64]) -> None:
         """Append a pose whose stamp is later than that of every pose before."""
         self._buffer.add(stamp_ns, T_world_body)

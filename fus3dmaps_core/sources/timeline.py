@@ -18,12 +18,10 @@ class Tally:
     """Counts of messages.
 
     Attributes:
-        received: Messages per topic, usable or not.
         drops: What led to no frame or was noteworthy, by reason.
         last_drop: The latest explanation of each reason; names the topic.
     """
 
-    received: Counter[str] = field(default_factory=Counter)
     drops: Counter[str] = field(default_factory=Counter)
     last_drop: dict[str, str] = field(default_factory=dict)
 
