@@ -102,9 +102,6 @@ class Diagnosis:
         self._clock_tolerance_s = clock_tolerance_s
         self._clock = clock
         self._lock = threading.Lock()
-        self._forget()
-
-    def _forget(self) -> None:
         self._started_s = self._last_offered_s = self._waiting_since_s = self._clock()
         self._arrivals = {topic: _Arrivals(RecentNumbers(self._window_s)) for topic in self._streams}
         self._offered = RecentNumbers(self._window_s)
@@ -118,11 +115,6 @@ class Diagnosis:
         self._depth_problems: dict[str, Problem | None] = {}
         self._poses: deque[tuple[NDArray[np.float64], float]] = deque(maxlen=_POSES)
         self._pose_topic = ""
-
-    def restart(self) -> None:
-        """Forget everything, as when mapping is started after a pause: silence counts from now."""
-        with self._lock:
-            self._forget()
 
     def arrived(self, topic: str, stamp_ns: int, now_ns: int) -> None:
         """A message came.

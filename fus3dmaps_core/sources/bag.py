@@ -27,8 +27,6 @@ class BagSource:
 
     Attributes:
         pairer: Counts what the current (or last) iteration received and dropped.
-        messages_read: Messages of the configured topics taken so far in this iteration.
-        messages_total: Messages of the configured topics in the recording.
     """
 
     def __init__(self, path: Path, config: InputConfig) -> None:
@@ -41,25 +39,19 @@ class BagSource:
         """
         self._config = config
         self.pairer, _ = self._new_pairer()
-        self.messages_read = 0
         self._reader = RecordingReader(path)
         try:
-            inputs = [(stream.role, self._require(stream)) for stream in self.pairer.streams()]
-            transforms = self._require_tf() if uses_tf(config) else []
+            found = [(stream.role, self._require(stream)) for stream in self.pairer.streams()]
+            if uses_tf(config):
+                self._require_tf()
         except RecordingError:
             self._reader.close()
             raise
-        self._frames = sum(found.count for role, found in inputs if role == "rgb")
-        self.messages_total = sum(found.count for found in [*(found for _, found in inputs), *transforms])
+        self._frames = sum(summary.count for role, summary in found if role == "rgb")
 
     def __len__(self) -> int:
         """Colour images in the recording, each of which becomes at most one frame."""
         return self._frames
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last message of the recording, seconds."""
-        return self._reader.duration_s
 
     def __iter__(self) -> Iterator[PairedMessages]:
         """The pairs in the order of the recording; messages that cannot be used are counted by :attr:`pairer`.
@@ -69,7 +61,6 @@ class BagSource:
         """
         self.pairer, add = self._new_pairer()
         pairer = self.pairer
-        self.messages_read = 0
         damage: RecordingError | None = None
         messages = self._reader.messages(add)
         while True:
@@ -80,7 +71,6 @@ class BagSource:
                 break
             if raw is None:
                 break
-            self.messages_read += 1
             try:
                 message = self._reader.deserialize(raw)
             except RecordingError as error:
@@ -128,13 +118,11 @@ class BagSource:
             problem = f"holds {found.msgtype} on topic '{topic}', not {msgtype}"
         raise self._refusal(f"{problem} (parameter '{stream.parameter}')")
 
-    def _require_tf(self) -> list[TopicSummary]:
-        topics = self._reader.topics
-        found = [topics[name] for name in _TF_TOPICS if name in topics and topics[name].msgtype == _TF_TYPE]
-        if not any(summary.count for summary in found):
+    def _require_tf(self) -> None:
+        found = [self._reader.topics.get(name) for name in _TF_TOPICS]
+        if not any(summary is not None and summary.msgtype == _TF_TYPE and summary.count for summary in found):
             source = "pose_source" if self._config.pose_source == "tf" else "extrinsic_source"
             raise self._refusal(f"holds no transforms on '/tf' or '/tf_static' (parameter 'input.{source}')")
-        return found
 
     def _refusal(self, problem: str) -> RecordingError:
         listing = ", ".join(f"{t.topic} ({t.msgtype}, {t.count} messages)" for t in self._reader.topics.values())

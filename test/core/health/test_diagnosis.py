@@ -455,14 +455,3 @@ def test_mapping_without_frames_is_stale() -> None:
     assert bench.diagnosis.report(NO_SIZES)[1].level == Level.STALE
     bench.diagnosis.offered(waiting=0)
     assert bench.diagnosis.report(NO_SIZES)[1].level == Level.OK
-
-
-def test_a_restart_forgets_and_counts_silence_anew() -> None:
-    bench = Bench()
-    bench.play(6.0, RGB.topic)
-    bench.diagnosis.dropped("no_depth", "no depth")
-    bench.diagnosis.restart()
-    assert bench.found() == {}
-    assert bench.diagnosis.drops() == {}
-    bench.now_s += 5.0
-    assert len(bench.diagnosis.problems()) == 4
