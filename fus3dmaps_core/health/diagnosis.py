@@ -1,4 +1,4 @@
-"""How the mapping fares, from what its parts say as they work: rates, delays, drops, and what is wrong in words."""
+"""State of the running mapping: rates, delays, drops, and sentences about what is wrong."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _POSES = 100
 
 @dataclass(frozen=True)
 class MapSizes:
-    """How large the map is.
+    """Size of the map.
 
     Attributes:
         voxels: Number of voxels.
@@ -42,10 +42,10 @@ class PartReport:
     """The state of one part.
 
     Attributes:
-        part: Which one.
-        level: The worst of its problems.
-        message: Its problems in words, or a line on how it fares.
-        values: Figures for people, by name.
+        part: The part.
+        level: The highest level of its problems.
+        message: Its problems in words, or a line about its state.
+        values: Figures in readable form, by name.
     """
 
     part: Part
@@ -63,10 +63,10 @@ class _Arrivals:
 
 
 class Diagnosis:
-    """Takes events as they happen and says on request how things stand. Thread-safe; events cost microseconds.
+    """Collects events while the node maps and reports the state on request. Thread-safe; an event costs microseconds.
 
-    Rates, latencies and shares are those of a sliding window. Time is a steady clock's: a paused or jumping ``/clock`` must
-    not hide what is wrong. The node's own clock only serves to compare stamps with it.
+    Rates, latencies and shares are those of the last ``window_s`` seconds of a steady clock, because a paused or jumping
+    ``/clock`` must not hide problems. Stamps alone are compared with the node's own clock.
     """
 
     def __init__(
@@ -81,17 +81,17 @@ class Diagnosis:
         clock_tolerance_s: float = 10.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start with nothing seen.
+        """Start without events.
 
         Args:
-            streams: The inputs whose messages :meth:`arrived` will tell of.
+            streams: The inputs whose messages are reported by :meth:`arrived`.
             sync_tolerance_s: ``input.sync_tolerance_s``.
             max_wait_s: ``input.max_wait_s``.
             use_sim_time: Whether the node's clock is ``/clock``.
-            silence_s: A topic without a message for so long is named.
-            window_s: Length of the sliding window.
-            clock_tolerance_s: Stamps may be so far from the node's clock.
-            clock: Seconds of a clock that never goes back.
+            silence_s: Time without a message after which a topic is reported, seconds.
+            window_s: Time over which rates, latencies and shares are computed, seconds.
+            clock_tolerance_s: Greatest difference between stamps and the node's clock, seconds.
+            clock: Clock that never goes back, seconds.
         """
         self._streams = {stream.topic: stream for stream in streams}
         self._sync_tolerance_s = sync_tolerance_s
@@ -117,7 +117,7 @@ class Diagnosis:
         self._pose_topic = ""
 
     def arrived(self, topic: str, stamp_ns: int, now_ns: int) -> None:
-        """A message came.
+        """Note that a message came.
 
         Args:
             topic: Name of one of the streams.
@@ -133,7 +133,11 @@ class Diagnosis:
             arrivals.ages_s.append((now_ns - stamp_ns) / 1e9)
 
     def offered(self, waiting: int) -> None:
-        """A complete frame was handed to mapping, and so many wait now."""
+        """Note that a complete frame was handed to mapping.
+
+        Args:
+            waiting: Frames that wait now.
+        """
         now_s = self._clock()
         with self._lock:
             self._offered.add(now_s)
@@ -143,10 +147,10 @@ class Diagnosis:
             self._waiting = waiting
 
     def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
-        """A frame has been dealt with, mapped or not.
+        """Note that the work on a frame has ended, whether it was mapped or not.
 
         Args:
-            durations_s: Time of each stage, seconds; empty for a frame that was no keyframe or failed.
+            durations_s: Time of each stage, seconds; empty for a frame that failed or was no keyframe.
             waiting: Frames that wait now.
         """
         now_s = self._clock()
@@ -159,12 +163,12 @@ class Diagnosis:
                 self._mapped.add(now_s, sum(durations_s.values()))
 
     def dropped(self, reason: str, sentence: str, number: int = 1) -> None:
-        """Messages or frames were dropped.
+        """Note that messages or frames were dropped.
 
         Args:
-            reason: Machine-readable cause, snake_case; ``queue_full`` is that mapping is too slow.
-            sentence: What happened to the latest of them.
-            number: How many.
+            reason: Machine-readable cause, snake_case; ``queue_full`` means that mapping is too slow.
+            sentence: Explanation of the latest of them.
+            number: Number of drops.
         """
         now_s = self._clock()
         with self._lock:
@@ -173,7 +177,7 @@ class Diagnosis:
             self._recent_drops.setdefault(reason, RecentNumbers(self._window_s)).add(now_s, number)
 
     def camera(self, topic: str, intrinsics: Intrinsics) -> None:
-        """A camera model came or changed."""
+        """Note that a camera model came or changed."""
         problem = input_problems.unlikely_intrinsics(topic, intrinsics)
         with self._lock:
             self._camera_problems[topic] = problem
@@ -187,14 +191,14 @@ class Diagnosis:
         encoding: str,
         pose_topic: str,
     ) -> None:
-        """A keyframe was decoded.
+        """Note that a keyframe was decoded.
 
         Args:
             T_world_camera: (4, 4) float64, its pose.
-            depth_m: (H, W) float32 metres, not valid where 0 or not finite.
-            depth_topic: Where depth comes from.
+            depth_m: (H, W) float32 metres, not valid if 0 or not finite.
+            depth_topic: Topic of depth.
             encoding: Encoding of the depth message.
-            pose_topic: Where the pose comes from.
+            pose_topic: Topic of the pose.
         """
         median_m, spread = input_problems.depth_statistics(depth_m)
         problem = input_problems.unlikely_depth(depth_topic, encoding, median_m)
@@ -204,29 +208,29 @@ class Diagnosis:
             self._pose_topic = pose_topic
 
     def rates_hz(self) -> dict[str, float]:
-        """Messages per second of each topic."""
+        """Compute the messages per second of each topic."""
         with self._lock:
             now_s = self._clock()
             return {topic: self._rate_hz(arrivals.recent, now_s) for topic, arrivals in self._arrivals.items()}
 
     def latencies(self) -> dict[str, Latency]:
-        """How long each stage took."""
+        """Compute the times of each stage."""
         with self._lock:
             return self._latencies(self._clock())
 
     def drops(self) -> Counter[str]:
-        """Drops by reason since the start."""
+        """Count the drops since the start, by reason."""
         with self._lock:
             return Counter(self._drops)
 
     def problems(
         self, offers: Mapping[str, Sequence[Offer]] | None = None, memory: Sequence[MemoryState] = ()
     ) -> list[Problem]:
-        """What is wrong now, inputs first.
+        """List what is wrong now, inputs first.
 
         Args:
-            offers: Publishers of each topic; None where they are not known.
-            memory: How full each memory is.
+            offers: Publishers of each topic; None if they are not known.
+            memory: Use of each memory.
         """
         with self._lock:
             now_s = self._clock()
@@ -237,12 +241,12 @@ class Diagnosis:
     def report(
         self, sizes: MapSizes, memory: Sequence[MemoryState] = (), offers: Mapping[str, Sequence[Offer]] | None = None
     ) -> list[PartReport]:
-        """The state of inputs, mapping, map and memory, in that order.
+        """Report the state of inputs, mapping, map and memory, in that order.
 
         Args:
-            sizes: How large the map is.
-            memory: How full each memory is.
-            offers: Publishers of each topic; None where they are not known.
+            sizes: Size of the map.
+            memory: Use of each memory.
+            offers: Publishers of each topic; None if they are not known.
         """
         found = self.problems(offers, memory)
         rates_hz, latencies, drops = self.rates_hz(), self.latencies(), self.drops()
@@ -278,7 +282,7 @@ class Diagnosis:
         return reports
 
     def _seen_s(self, now_s: float) -> float:
-        """How much of the window has passed yet, seconds; never zero."""
+        """Return how much of the window has passed since the start, seconds; never zero."""
         return max(min(self._window_s, now_s - self._started_s), 1e-9)
 
     def _rate_hz(self, window: RecentNumbers, now_s: float) -> float:
@@ -327,7 +331,7 @@ class Diagnosis:
         return [problem for problem in found if problem is not None]
 
     def _stamp_problems(self, live: Mapping[str, _Arrivals]) -> list[Problem | None]:
-        """What the stamps of streams say that should go together; the n-th of colour and of depth are of one camera."""
+        """Compare the stamps of streams that belong together; the n-th colour and n-th depth stream share a camera."""
         roles = {role: [s for s in self._streams.values() if s.role == role] for role in ("rgb", "depth", "pose")}
         pairs = [*zip(roles["rgb"], roles["depth"], strict=False)]
         pairs += [(rgb, pose) for rgb in roles["rgb"] for pose in roles["pose"]]

@@ -1,4 +1,4 @@
-"""Reading of rosbag2 recordings: raw CDR messages in time order, also from files that break off."""
+"""Reading of rosbag2 recordings: raw CDR messages in time order, also from truncated files."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _SUFFIXES = (".mcap", ".db3")
 class RecordingReader:
     """A rosbag2 directory (``metadata.yaml`` and its .mcap or .db3 files) or a bare .mcap or .db3 file.
 
-    A directory whose recorder was killed before it wrote ``metadata.yaml`` is read file by file. Of a damaged .mcap file,
-    what is readable is delivered. Use it as a context manager.
+    A directory without ``metadata.yaml``, whose recorder was killed, is read file by file. The readable part of a damaged
+    .mcap file is delivered. Use it as a context manager.
 
     Attributes:
-        path: What was opened.
-        damage: What is wrong with the files, or None. Damage inside an indexed file shows only while it is read.
+        path: The file or directory that was opened.
+        damage: What is wrong with the files, or None. Damage inside an indexed file is only found while it is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,7 +49,7 @@ class RecordingReader:
 
     @property
     def topics(self) -> dict[str, TopicSummary]:
-        """What the recording holds, by topic."""
+        """Summaries of the recording's topics, by name."""
         merged: dict[str, TopicSummary] = {}
         for part in self._parts:
             for topic, summary in part.topics.items():
@@ -59,7 +59,7 @@ class RecordingReader:
 
     @property
     def message_count(self) -> int:
-        """Number of messages on all topics; of a damaged file, those that can be read."""
+        """Number of readable messages on all topics."""
         return sum(summary.count for part in self._parts for summary in part.topics.values())
 
     @property
@@ -78,7 +78,7 @@ class RecordingReader:
         return (self.end_ns - self.start_ns) / 1e9
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """The messages in order of time (of a damaged file: in its own order), of the given topics or of all.
+        """Yield the messages of the given topics, or of all, in order of time; those of a damaged file in its own order.
 
         Raises:
             RecordingError: After everything readable was delivered, if the recording is damaged.
@@ -89,7 +89,7 @@ class RecordingReader:
             while True:
                 try:
                     message = next(iterator, None)
-                # Whatever a parser stumbles over in a damaged file, the answer is the same and names the file.
+                # Any failure of a parser in a damaged file is answered the same way, by an error that names the file.
                 except Exception as error:
                     self.damage = self.damage or _reason(error)
                     break
@@ -122,7 +122,7 @@ class RecordingReader:
         self._parts = []
 
     def __enter__(self) -> RecordingReader:
-        """Nothing to do: the recording is open already."""
+        """Return the reader: the recording is open already."""
         return self
 
     def __exit__(
@@ -172,7 +172,7 @@ class RecordingReader:
 
 
 class _IndexedFiles:
-    """What rosbags can open: a directory with metadata, or a complete file."""
+    """A directory with metadata or a complete file, which rosbags can open."""
 
     def __init__(self, path: Path) -> None:
         self._reader = Reader(path)
@@ -205,5 +205,5 @@ def _reason(error: Exception) -> str:
 
 
 def _natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which ``bag_10`` follows ``bag_9``."""
+    """Return a sort key by which ``bag_10`` follows ``bag_9``."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

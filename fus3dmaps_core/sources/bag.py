@@ -20,21 +20,21 @@ _TF_TOPICS = ("/tf", "/tf_static")
 
 
 class BagSource:
-    """Reads the topics that the configuration names from a recording and pairs them as the live node does.
+    """Reads the configured topics from a recording and pairs their messages as the live node does.
 
-    Topic names match with or without their leading slash. TF is what the recording holds on ``/tf`` and ``/tf_static``. Use
-    it as a context manager; each iteration starts anew.
+    Topic names match with or without their leading slash. TF is read from ``/tf`` and ``/tf_static``. Use it as a context
+    manager; each iteration starts from the beginning.
 
     Attributes:
-        pairer: Counts what the current (or last) iteration received and dropped.
+        pairer: The pairer of the current (or last) iteration; it counts drops.
     """
 
     def __init__(self, path: Path, config: InputConfig) -> None:
         """Open a recording.
 
         Raises:
-            RecordingError: It cannot be read, or lacks a topic or holds it with another message type; the message names
-                the topic and its parameter and lists what the recording has.
+            RecordingError: It cannot be read, or a topic is missing or has another message type. The message names the
+                topic and its parameter and lists the topics of the recording.
             ConfigError: As :class:`FramePairer`.
         """
         self._config = config
@@ -50,11 +50,11 @@ class BagSource:
         self._frames = sum(summary.count for role, summary in found if role == "rgb")
 
     def __len__(self) -> int:
-        """Colour images in the recording, each of which becomes at most one frame."""
+        """Count the colour images in the recording; each becomes at most one frame."""
         return self._frames
 
     def __iter__(self) -> Iterator[PairedMessages]:
-        """The pairs in the order of the recording; messages that cannot be used are counted by :attr:`pairer`.
+        """Yield the pairs in the order of the recording; :attr:`pairer` counts messages that cannot be used.
 
         Raises:
             RecordingError: After everything readable was delivered, if the recording is damaged.
@@ -87,7 +87,7 @@ class BagSource:
         self._reader.close()
 
     def __enter__(self) -> BagSource:
-        """Nothing to do: the recording is open already."""
+        """Return the source: the recording is open already."""
         return self
 
     def __exit__(
@@ -97,7 +97,7 @@ class BagSource:
         self.close()
 
     def _new_pairer(self) -> tuple[FramePairer, dict[str, Callable[[Any], None]]]:
-        """A pairer, and what takes the messages of each topic of the recording for it."""
+        """Make a pairer, and a function for each topic that hands it a message."""
         tree = TransformTree(self._config.max_pose_gap_s) if uses_tf(self._config) else None
         pairer = FramePairer(self._config, tree)
         add = {_absolute(stream.topic): stream.add for stream in pairer.streams()}

@@ -1,4 +1,4 @@
-"""One camera: its colour images meet depth, pose and camera model by stamp."""
+"""Pairing for one camera: each colour image with depth, pose and camera model by stamp."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _Stamped:
 
 
 class _Models:
-    """What ``camera_info`` said over time, for the images whose time it was."""
+    """The camera models of a ``camera_info`` topic over time."""
 
     def __init__(self, config: InputConfig, topic: str, tally: Tally) -> None:
         self.topic = topic
@@ -58,7 +58,7 @@ class _Models:
         self._models.append((stamp_ns, model))
 
     def at(self, stamp_ns: int) -> CameraModel | None:
-        """The latest that is not from after the stamp, else the first."""
+        """Return the latest model up to the stamp, or the first one if all are later."""
         earlier = [model for start_ns, model in self._models if start_ns <= stamp_ns]
         if earlier:
             return earlier[-1]
@@ -69,7 +69,7 @@ class _Models:
             self._models.popleft()
 
     def start_anew(self) -> None:
-        """The camera is the same when its clock changes."""
+        """Keep only the latest model, for all of the new time: a new clock does not change the camera."""
         if self._models:
             self._models = deque([(0, self._models[-1][1])])
 
@@ -91,12 +91,12 @@ class CameraPairer:
 
         Args:
             config: Tolerances and transports.
-            topics: Of this camera.
-            poses: Of the body; shared with the other cameras.
-            mounting: Of the camera on the body.
-            camera_frame: Its optical frame in TF; empty: what the images say.
+            topics: Topics of this camera.
+            poses: Poses of the body; shared with the other cameras.
+            mounting: Mounting of the camera on the body.
+            camera_frame: Its optical frame in TF; if empty, the frame named by the images.
             timeline: Stamps of all inputs.
-            tally: Counts of all inputs.
+            tally: Drops of all inputs.
         """
         self._config = config
         self._topics = topics
@@ -115,7 +115,7 @@ class CameraPairer:
 
     @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest colour image that waits."""
+        """Stamp of the oldest waiting colour image, nanoseconds."""
         return self._rgb[0].stamp_ns if self._rgb else None
 
     def streams(self) -> Iterator[Stream]:
@@ -168,7 +168,7 @@ class CameraPairer:
             self._depth_models.add(message)
 
     def settle(self, final: bool) -> list[PairedMessages]:
-        """Pair or drop the oldest colour images until one has to wait; with ``final`` none waits."""
+        """Pair or drop colour images, oldest first, until one has to wait. With ``final`` none waits."""
         ready = []
         newest_ns = self._timeline.newest_ns
         while self._rgb:
@@ -185,12 +185,12 @@ class CameraPairer:
         return ready
 
     def forget_needless(self) -> int:
-        """Forget what no colour image can need any more.
+        """Remove messages that no colour image can need any more.
 
         Returns:
-            The earliest stamp, nanoseconds, at which one may still need something.
+            The earliest stamp, nanoseconds, whose messages may still be needed.
         """
-        # What is older than this can meet no colour image any more: colour stamps only rise.
+        # Older messages can match no colour image any more, because colour stamps only rise.
         oldest_ns = self._timeline.newest_ns - self._max_wait_ns
         if self._rgb:
             oldest_ns = self._rgb[0].stamp_ns
@@ -204,7 +204,7 @@ class CameraPairer:
         return oldest_ns
 
     def start_anew(self) -> None:
-        """Forget what waits; the camera model stays."""
+        """Remove waiting images; the camera model stays."""
         self._rgb.clear()
         self._depth.clear()
         self._models.start_anew()
@@ -218,7 +218,7 @@ class CameraPairer:
             self._tally.drop(FrameError(f"{topic}: frame_id changed from '{known}' to '{frame}'", reason="frame_id_changed"))
 
     def _pair(self, rgb: _Stamped, waited_ns: int) -> PairedMessages | None:
-        """The complete pair, or None while something may still come; FrameError once something cannot."""
+        """Return the complete pair, or None while a part may still come; raise FrameError once a part cannot come."""
         final = waited_ns > self._max_wait_ns
         moment = Moment(self._topics.rgb, self._camera_frame or rgb.frame, rgb.stamp_ns, waited_ns)
         depth = self._depth_for(rgb, final)
@@ -251,7 +251,7 @@ class CameraPairer:
 
     def _depth_for(self, rgb: _Stamped, final: bool) -> _Stamped | None:
         last_ns = self._timeline.last_ns.get(self._topics.depth)
-        # The nearest is known once depth has come as far as the colour image.
+        # The nearest depth image is known once depth has reached the stamp of the colour image.
         if not final and (last_ns is None or last_ns < rgb.stamp_ns):
             return None
         nearest = min(self._depth, key=lambda depth: abs(depth.stamp_ns - rgb.stamp_ns), default=None)
@@ -286,7 +286,7 @@ class CameraPairer:
         return UnregisteredDepth(model, T_rgb_depth)
 
     def _check_same_view(self, rgb_size: tuple[int, int], depth_size: tuple[int, int]) -> None:
-        """Registered depth may be of another resolution, not of another shape."""
+        """Raise FrameError if registered depth has another aspect ratio than colour; its resolution may differ."""
         (rgb_width, rgb_height), (width, height) = rgb_size, depth_size
         if abs(width * rgb_height / (height * rgb_width) - 1.0) > _ASPECT_TOLERANCE:
             raise FrameError(

@@ -1,6 +1,6 @@
-"""From single messages to posed frames: colour meets depth, pose and camera model by stamp, for one camera or several.
+"""Pairing of single messages by stamp: colour with depth, pose and camera model, for one camera or several.
 
-The same class serves the live node and recordings. It looks at headers only; pixels are decoded when a frame is wanted.
+The same class serves the live node and recordings. It only reads headers; pixels are decoded when a frame is wanted.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ __all__ = ["FramePairer", "PairedMessages"]
 class FramePairer:
     """Pairs each colour image with the nearest depth image and the pose at its stamp.
 
-    Hand it messages through its :meth:`streams` and call :meth:`poll` after each. Whatever cannot be used
-    is dropped and counted, never raised. Time is that of the stamps: an image is given up once any input has moved
-    ``max_wait_s`` (for a transform: ``tf_timeout_s``) past it, so memory stays bounded by what arrives in that span. A stamp
-    that goes back more than three seconds (a looped recording, a restarted simulation) ends what was waiting and pairing
-    goes on from the new time. A camera model holds from its stamp until one that differs. Several cameras share the poses
+    Hand it messages through its :meth:`streams` and call :meth:`poll` after each. Messages that
+    cannot be used are dropped and counted; nothing is raised. Time is the time of the stamps: an image is dropped once any
+    input is ``max_wait_s`` (for a transform: ``tf_timeout_s``) past it, which bounds the memory. If a stamp goes back more
+    than three seconds (a looped recording, a restarted simulation), waiting images are paired or dropped and pairing goes
+    on from the new time. A camera model is valid from its stamp until a different one comes. Several cameras share the poses
     and the clock; their frames come in the order of their stamps. Not thread-safe: callers hold a lock.
     """
 
@@ -37,7 +37,7 @@ class FramePairer:
 
         Args:
             config: Topics, pose source, mounting of the cameras.
-            transforms: TF, which some pose and extrinsic sources need.
+            transforms: TF, needed by some pose and extrinsic sources.
 
         Raises:
             ConfigError: ``input.T_body_camera`` or ``input.T_rgb_depth`` is not a pose, or TF is needed and not given.
@@ -68,18 +68,18 @@ class FramePairer:
 
         ``unknown_encoding``, ``bad_image``, ``size_mismatch``, ``bad_intrinsics``, ``bad_pose``, ``bad_transform``,
         ``wrong_frame``, ``stamp_backwards``, ``stamp_repeated``, ``no_camera_info``, ``no_depth``, ``no_pose``,
-        ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without loss of a frame:
+        ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without losing a frame:
         ``time_jump``, ``intrinsics_changed``, ``frame_id_changed``.
         """
         return self._tally.drops
 
     @property
     def last_drop(self) -> dict[str, str]:
-        """The latest explanation of each reason; names the topic."""
+        """Explanation of the latest drop of each reason; it names the topic."""
         return self._tally.last_drop
 
     def streams(self) -> list[Stream]:
-        """Every topic to listen to, but for TF: those of the cameras, then the poses."""
+        """List every topic to listen to except TF: those of the cameras, then the poses."""
         streams = [stream for camera in self._cameras for stream in camera.streams()]
         msgtype = pose_type(self._config)
         if msgtype is not None:
@@ -111,18 +111,18 @@ class FramePairer:
         self._buffered.add(stamp_ns, T_world_body)
 
     def poll(self) -> list[PairedMessages]:
-        """The pairs that have become complete since the last call, in stamp order (between two time jumps)."""
+        """Return the pairs completed since the last call, in stamp order (between two time jumps)."""
         self._settle(final=False)
         ready, self._ready = self._ready, []
         return ready
 
     def flush(self) -> list[PairedMessages]:
-        """As :meth:`poll`, when nothing more will come: what still waits is paired with what is there, or dropped."""
+        """Return the last pairs when no more messages will come: what waits is paired with what is there, or dropped."""
         self._settle(final=True)
         return self.poll()
 
     def reset(self) -> None:
-        """Forget everything that waits and the stamps seen; the camera models and the counts stay."""
+        """Remove everything that waits and the stamps seen; camera models and counts stay."""
         self._ready.clear()
         self._held.clear()
         self._timeline.clear()
@@ -142,7 +142,7 @@ class FramePairer:
         for camera in self._cameras:
             self._held += camera.settle(final)
         self._held.sort(key=lambda paired: paired.stamp_ns)
-        # A frame goes on once no camera has an earlier image that may yet become one.
+        # A frame is ready once no camera has an earlier image that may still become a frame.
         waiting = [camera.oldest_ns for camera in self._cameras if camera.oldest_ns is not None]
         earliest_ns = min(waiting, default=None)
         while self._held and (earliest_ns is None or self._held[0].stamp_ns <= earliest_ns):

@@ -57,7 +57,7 @@ class Stream:
 
     @property
     def qos(self) -> Qos:
-        """What the profile asks of publishers."""
+        """Reliability and durability of the profile."""
         return QOS_PROFILES[self.profile]
 
     @property
@@ -79,7 +79,7 @@ class CameraTopics:
         rgb: Colour images, with the transport's suffix.
         depth: Depth images, with the transport's suffix.
         camera_info: Camera model of the colour images.
-        depth_camera_info: Camera model of the depth images, None where they are registered to colour.
+        depth_camera_info: Camera model of the depth images, None if they are registered to colour.
     """
 
     rgb: str
@@ -89,7 +89,7 @@ class CameraTopics:
 
 
 def camera_topics(config: InputConfig) -> list[CameraTopics]:
-    """The topics of each camera, in the order in which ``input.cameras`` names them."""
+    """Return the topics of each camera, in the order of ``input.cameras``."""
     topics = []
     for name in config.camera_names:
         namespace = f"{name}/" if name else ""
@@ -105,30 +105,30 @@ def camera_topics(config: InputConfig) -> list[CameraTopics]:
 
 
 def image_type(transport: str) -> str:
-    """Message type of images of a transport."""
+    """Return the message type of images of a transport."""
     return "sensor_msgs/msg/Image" if transport == "raw" else "sensor_msgs/msg/CompressedImage"
 
 
 def pose_parameter(config: InputConfig) -> str:
-    """Name of the field of the configuration that holds the topic of the poses; of no use with TF."""
+    """Return the name of the configuration field that holds the pose topic; has no meaning with TF."""
     return f"{config.pose_source}_topic"
 
 
 def pose_topic(config: InputConfig) -> str:
-    """Topic of the poses; ``TF`` where they come from there."""
+    """Return the topic of the poses, or ``TF`` if they come from there."""
     return "TF" if config.pose_source == "tf" else str(getattr(config, pose_parameter(config)))
 
 
 def pose_type(config: InputConfig) -> str | None:
-    """Message type of the poses, None where they come from TF."""
+    """Return the message type of the poses, None if they come from TF."""
     return _POSE_TYPES.get(config.pose_source)
 
 
 def uses_tf(config: InputConfig) -> bool:
-    """Whether poses or extrinsics are looked up in TF."""
+    """Return whether poses or extrinsics are looked up in TF."""
     return "tf" in (config.pose_source, config.extrinsic_source)
 
 
 def _with_transport(topic: str, transport: str) -> str:
-    """The name under which image_transport publishes."""
+    """Return the name under which image_transport publishes."""
     return topic if transport == "raw" or topic.endswith(f"/{transport}") else f"{topic}/{transport}"
