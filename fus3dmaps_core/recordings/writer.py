@@ -53,10 +53,10 @@ _OFFERED_QOS = """\
 class RecordingWriter:
     """Writes camera model, pose, depth and colour image of each frame, in this order, with the frame's stamp.
 
-    The file has the form of ``ros2 bag record --storage mcap``: profile ``ros2``, CDR messages, full message definitions. Depth is
-    16UC1 millimetres (REP-118; 0 where there is no reading or beyond 65.5 m), colour rgb8. Poses are PoseStamped on the
-    configured pose topic; a reader with the same configuration gets the camera's pose back. Equal frames give equal bytes.
-    The file gets its name only when the ``with`` block ends without an exception.
+    The file has the form of ``ros2 bag record --storage mcap``: profile ``ros2``, CDR messages, full message definitions.
+    Depth is 16UC1 millimetres (REP-118; 0 where there is no reading or beyond 65.5 m), colour rgb8. Poses are PoseStamped
+    on the configured pose topic; a reader with the same configuration gets the camera's pose back. Equal frames give equal
+    bytes. The file gets its name only when the ``with`` block ends without an exception.
 
     Attributes:
         frame_count: Frames written so far.

@@ -1,4 +1,4 @@
-"""What stands where in a room: pieces along the walls and small things on them, without interpenetration."""
+"""Furnishing of rooms: furniture along the walls with small things on it, without overlaps."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _ATTEMPTS = 40
 
 @dataclass(frozen=True)
 class RoomKind:
-    """What belongs into a room.
+    """The furniture of a kind of room.
 
     Attributes:
-        name: Of the kind.
-        along_walls: Pieces that stand against walls, the most important first.
+        name: Name of the kind.
+        along_walls: Furniture that stands against walls, the most important first.
         small: Things that stand on surfaces.
         on_soft: Things that lie on sofas and beds.
     """
@@ -76,7 +76,7 @@ class Space:
     Attributes:
         low_m: Lower corner, on the floor.
         high_m: Upper corner, below the ceiling.
-        reserved_m: (n, 2, 2) rectangles (low xy, high xy) that must stay free: doors and the robot's way.
+        reserved_m: (n, 2, 2) rectangles (low xy, high xy) that must stay free: doors and the robot's route.
         windows_m: (n, 2, 2) rectangles along the walls where nothing can hang.
     """
 
@@ -87,7 +87,7 @@ class Space:
 
 
 def furnish(builder: BoxWorldBuilder, kind: RoomKind, space: Space, rng: Rng) -> None:
-    """Put things into a room: what finds no place is left out."""
+    """Put things into a room; leave out those that find no place."""
     taken = [*space.reserved_m]
     for maker in kind.along_walls:
         thing = maker(rng)
@@ -110,7 +110,7 @@ def furnish(builder: BoxWorldBuilder, kind: RoomKind, space: Space, rng: Rng) ->
 
 
 def _place_at_wall(thing: Thing, space: Space, taken: list[NDArray[np.float64]], rng: Rng) -> Pose | None:
-    """A place along a wall, noted as taken; None where none was found."""
+    """Find a place along a wall and mark it as taken; return None if there is none."""
     width, depth, _ = thing.size_m
     for _ in range(_ATTEMPTS):
         turns = int(rng.integers(4))
@@ -126,8 +126,8 @@ def _place_at_wall(thing: Thing, space: Space, taken: list[NDArray[np.float64]],
 
 
 def _at_wall(space: Space, turns: int, width: float, share: float, z: float) -> Pose | None:
-    """A pose with its back at one of the four walls (0: the northern), ``share`` along it."""
-    along = turns % 2  # The axis of the wall: x for the northern and the southern one.
+    """Return a pose with its back to one of the four walls (0: the northern), at a share of the wall's length."""
+    along = turns % 2  # The axis of the wall: x for the northern and the southern wall.
     room = float(space.high_m[along] - space.low_m[along]) - width - 2 * _GAP_M
     if room < 0:
         return None
@@ -144,7 +144,7 @@ def _meets(rectangle: NDArray[np.float64], others: Sequence[NDArray[np.float64]]
 
 
 def _decorate(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequence[Maker], rng: Rng) -> None:
-    """Two to four small things on a surface, side by side; what goes behind is behind what goes in front."""
+    """Put two to four small things side by side on a surface."""
     width, depth, _ = thing.size_m
     chosen = [makers[int(index)](rng) for index in rng.permutation(len(makers))[: int(rng.integers(2, 5))]]
     x = -0.5 * width + 0.04
@@ -157,7 +157,7 @@ def _decorate(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequen
 
 
 def _cushion(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequence[Maker], rng: Rng) -> None:
-    """Pillows: side by side on a sofa, behind one another at the head of a bed."""
+    """Add pillows: side by side on a sofa, behind one another at the head of a bed."""
     things = [maker(rng) for maker in makers]
     for place, small in enumerate(things):
         if thing.class_name == "sofa":
@@ -169,7 +169,7 @@ def _cushion(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequenc
 
 
 def _fill_shelves(builder: BoxWorldBuilder, pose: Pose, rng: Rng) -> None:
-    """A row of books on every board: one instance each row, its books the parts."""
+    """Put a row of books on every board. Each row is one instance; its books are the parts."""
     for z in t.SHELF_HEIGHTS_M:
         pieces: list[Piece] = []
         x, end = -0.45, float(rng.uniform(-0.1, 0.42))
@@ -182,7 +182,7 @@ def _fill_shelves(builder: BoxWorldBuilder, pose: Pose, rng: Rng) -> None:
 
 
 def _hang(builder: BoxWorldBuilder, thing: Thing, space: Space, taken: list[NDArray[np.float64]], rng: Rng) -> None:
-    """On a piece of wall where nothing stands and no door or window is."""
+    """Hang a thing on a piece of wall without furniture, door or window."""
     for _ in range(_ATTEMPTS):
         pose = _at_wall(space, int(rng.integers(4)), thing.size_m[0], float(rng.uniform()), float(space.low_m[2]) + 1.5)
         if pose is None:
