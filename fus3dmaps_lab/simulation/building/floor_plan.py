@@ -1,7 +1,7 @@
 """Plan and shell of a building: storeys with rooms on both sides of a corridor, joined by stairs.
 
-Each storey's corridor runs east along y = 0. Rooms lie north and south of it; each has a door to the corridor and a window in
-its outer wall. The stairs are beyond the corridor's eastern end. Walls, floors, ceilings, doors, windows and stairs are
+Each storey's corridor runs east along y = 0. Rooms lie north and south of it; each has a door to it and a window in its
+outer wall. The stairs are beyond the corridor's eastern end. Walls, floors, ceilings, doors, windows and stairs are
 instances like everything else.
 """
 
