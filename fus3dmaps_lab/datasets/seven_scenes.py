@@ -1,4 +1,4 @@
-"""7-Scenes: Kinect recordings of seven rooms by Microsoft Research (Shotton et al. 2013), or any in their layout."""
+"""7-Scenes: Kinect recordings of seven rooms by Microsoft Research (Shotton et al. 2013), or others in their layout."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _NOMINAL_K = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]
 class SevenScenes(ImageSequence):
     """One sequence: ``frame-NNNNNN.color.png`` (or .jpg), ``.depth.png`` (16-bit millimetres), ``.pose.txt``.
 
-    Poses are camera-to-world matrices of the optical frame, metres. Depth of 0 and 65535 is no reading. Intrinsics come from
-    ``camera-intrinsics.txt`` (3x3) if it is there, else they are the dataset's nominal ones (585, 585, 320, 240). Stamps
-    follow from the frame numbers at 30 Hz. All of this is as the dataset's page states it, but for the intrinsics file.
+    Poses are camera-to-world matrices of the optical frame, metres. Depth of 0 and 65535 is no reading. Intrinsics are read
+    from ``camera-intrinsics.txt`` (3x3) if it exists; otherwise the dataset's nominal ones are used (585, 585, 320, 240).
+    Stamps follow from the frame numbers at 30 Hz. The dataset's page states all of this except the intrinsics file.
     """
 
     name = "sevenscenes"
@@ -40,8 +40,8 @@ class SevenScenes(ImageSequence):
         """List the sequence and read its poses.
 
         Args:
-            directory: Of one sequence, e.g. ``seq-01``.
-            stride: Every n-th frame is taken.
+            directory: Folder of one sequence, e.g. ``seq-01``.
+            stride: Take every n-th frame.
 
         Raises:
             RecordingError: The directory is missing or holds no frames, a frame lacks its depth or pose file, a pose is not
