@@ -1,4 +1,4 @@
-"""Results of an evaluation as flat records, and the files they are kept in."""
+"""Results of an evaluation as flat records, and writing them to a file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LAYERS = ("dense", "fused_dense", "instances", "fused_instances")
 """Layers that are evaluated."""
 
 MODES = ("full", "window", "window_no_evidence")
-"""Whole dense layer; sliding window; sliding window whose fused embeddings are replaced whatever their evidence."""
+"""Whole dense layer; sliding window; sliding window that replaces fused embeddings even by ones of less evidence."""
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,13 @@ class Record:
     """One number of one map.
 
     Attributes:
-        scene: Scene, e.g. ``building`` or ``room0``; what is simulated says so in its name.
+        scene: Scene, e.g. ``building`` or ``room0``; the name of a simulated scene says so.
         seed: Seed of a simulation, 0 for recorded scenes.
         layer: One of LAYERS.
         mode: One of MODES.
-        metric: ``mIoU``, ``f-mIoU``, ``accuracy`` (share of voxels right), ``mean_accuracy`` (mean over classes), the same
+        metric: ``mIoU``, ``f-mIoU``, ``accuracy`` (share of right voxels), ``mean_accuracy`` (mean over classes), the same
             with ``_with_background``; ``iou/NAME`` of a class; others as their modules name them.
-        value: The number; NaN where it is undefined.
+        value: The number; NaN if it is undefined.
     """
 
     scene: str
@@ -45,9 +45,9 @@ class CurvePoint:
 
     Attributes:
         experiment: ``lambda``, ``lambda_per_embedding``, ``memory``, ``window_radius`` or ``association``.
-        curve: Which of its curves, e.g. ``R^D / R^I = 5``.
+        curve: Name of the curve, e.g. ``R^D / R^I = 5``.
         seed: Seed of the simulation.
-        x: Where along the curve: lambda, mapped volume in m^3, radius in m, threshold.
+        x: Place along the curve: lambda, mapped volume in m^3, radius in m, threshold.
         metric: As in :class:`Record`, or ``bytes``.
         value: The number.
     """
@@ -63,11 +63,11 @@ class CurvePoint:
 def write_records(path: Path, records: Iterable[Record]) -> None:
     """Write records as a JSON list of {scene, seed, layer, mode, metric, value}, NaN as null.
 
-    What was in the file is replaced at once, or stays.
+    The file is replaced as a whole, or stays as it was after an error.
 
     Args:
-        path: The file; folders above it are made.
-        records: In the order in which they are written.
+        path: The file; missing folders are made.
+        records: Records in the order of the file.
 
     Raises:
         StorageError: A value is infinite, or the file cannot be written.
