@@ -14,7 +14,6 @@ from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.health.diagnosis import Diagnosis, MapSizes
 from fus3dmaps_core.health.input_problems import Level, Offer, stamp_difference, unheard
 from fus3dmaps_core.health.mapping_problems import Latency, MemoryState
-from fus3dmaps_core.health.recent_numbers import RecentNumbers
 from fus3dmaps_core.sources.streams import Qos, Stream
 
 SECOND_NS = 10**9
@@ -73,16 +72,6 @@ def test_rates_are_those_of_the_window_and_honest_before_it_is_full() -> None:
     assert bench.diagnosis.rates_hz()[RGB.topic] == pytest.approx(2.0)
     bench.now_s += 10.0
     assert bench.diagnosis.rates_hz()[RGB.topic] == 0.0
-
-
-@given(st.lists(st.tuples(st.floats(0.0, 3.0), st.floats(-1e6, 1e6)), max_size=60), st.floats(0.1, 5.0))
-def test_the_window_holds_what_a_filter_of_everything_holds(steps, length_s) -> None:
-    window, now_s, everything = RecentNumbers(length_s), 0.0, []
-    for step_s, number in steps:
-        now_s += step_s
-        window.add(now_s, number)
-        everything.append((now_s, number))
-        assert window.numbers(now_s) == [kept for at_s, kept in everything if at_s > now_s - length_s]
 
 
 def test_latency_is_mean_and_maximum_per_stage_in_the_window() -> None:
