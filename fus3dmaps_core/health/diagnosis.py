@@ -65,7 +65,7 @@ class _Arrivals:
 class Diagnosis:
     """Collects events while the node maps and reports the state on request. Thread-safe; an event costs microseconds.
 
-    Rates, latencies and shares are those of the last ``window_s`` seconds of a steady clock, because a paused or jumping
+    Rates, latencies and shares are those of the last ``recent_s`` seconds of a steady clock, because a paused or jumping
     ``/clock`` must not hide problems. Stamps alone are compared with the node's own clock.
     """
 
@@ -77,7 +77,7 @@ class Diagnosis:
         max_wait_s: float,
         use_sim_time: bool = False,
         silence_s: float = 5.0,
-        window_s: float = 10.0,
+        recent_s: float = 10.0,
         clock_tolerance_s: float = 10.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -89,7 +89,7 @@ class Diagnosis:
             max_wait_s: ``input.max_wait_s``.
             use_sim_time: Whether the node's clock is ``/clock``.
             silence_s: Time without a message after which a topic is reported, seconds.
-            window_s: Time over which rates, latencies and shares are computed, seconds.
+            recent_s: Time over which rates, latencies and shares are computed, seconds.
             clock_tolerance_s: Greatest difference between stamps and the node's clock, seconds.
             clock: Clock that never goes back, seconds.
         """
@@ -98,14 +98,14 @@ class Diagnosis:
         self._max_wait_s = max_wait_s
         self._use_sim_time = use_sim_time
         self._silence_s = silence_s
-        self._window_s = window_s
+        self._recent_s = recent_s
         self._clock_tolerance_s = clock_tolerance_s
         self._clock = clock
         self._lock = threading.Lock()
         self._started_s = self._last_offered_s = self._waiting_since_s = self._clock()
-        self._arrivals = {topic: _Arrivals(RecentNumbers(self._window_s)) for topic in self._streams}
-        self._offered = RecentNumbers(self._window_s)
-        self._mapped = RecentNumbers(self._window_s)
+        self._arrivals = {topic: _Arrivals(RecentNumbers(self._recent_s)) for topic in self._streams}
+        self._offered = RecentNumbers(self._recent_s)
+        self._mapped = RecentNumbers(self._recent_s)
         self._waiting = 0
         self._stages: dict[str, RecentNumbers] = {}
         self._drops: Counter[str] = Counter()
@@ -158,7 +158,7 @@ class Diagnosis:
             self._waiting_since_s = now_s
             self._waiting = waiting
             for stage, duration_s in durations_s.items():
-                self._stages.setdefault(stage, RecentNumbers(self._window_s)).add(now_s, duration_s)
+                self._stages.setdefault(stage, RecentNumbers(self._recent_s)).add(now_s, duration_s)
             if durations_s:
                 self._mapped.add(now_s, sum(durations_s.values()))
 
@@ -174,7 +174,7 @@ class Diagnosis:
         with self._lock:
             self._drops[reason] += number
             self._last_drop[reason] = sentence
-            self._recent_drops.setdefault(reason, RecentNumbers(self._window_s)).add(now_s, number)
+            self._recent_drops.setdefault(reason, RecentNumbers(self._recent_s)).add(now_s, number)
 
     def camera(self, topic: str, intrinsics: Intrinsics) -> None:
         """Note that a camera model came or changed."""
@@ -282,19 +282,19 @@ class Diagnosis:
         return reports
 
     def _seen_s(self, now_s: float) -> float:
-        """Return how much of the window has passed since the start, seconds; never zero."""
-        return max(min(self._window_s, now_s - self._started_s), 1e-9)
+        """Return the time over which recent numbers came, seconds: less than ``recent_s`` after the start, never zero."""
+        return max(min(self._recent_s, now_s - self._started_s), 1e-9)
 
-    def _rate_hz(self, window: RecentNumbers, now_s: float) -> float:
-        return len(window.numbers(now_s)) / self._seen_s(now_s)
+    def _rate_hz(self, recent: RecentNumbers, now_s: float) -> float:
+        return len(recent.numbers(now_s)) / self._seen_s(now_s)
 
     def _latencies(self, now_s: float) -> dict[str, Latency]:
-        durations_s = {stage: window.numbers(now_s) for stage, window in self._stages.items()}
+        durations_s = {stage: recent.numbers(now_s) for stage, recent in self._stages.items()}
         return {stage: Latency(len(s), sum(s) / len(s), max(s)) for stage, s in durations_s.items() if s}
 
     def _recent_drop(self, reason: str, now_s: float) -> int:
-        window = self._recent_drops.get(reason)
-        return round(sum(window.numbers(now_s))) if window else 0
+        recent = self._recent_drops.get(reason)
+        return round(sum(recent.numbers(now_s))) if recent else 0
 
     def _pace(self, now_s: float) -> Pace:
         offered, unmapped = len(self._offered.numbers(now_s)), self._recent_drop("queue_full", now_s)
