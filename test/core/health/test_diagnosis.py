@@ -1,4 +1,4 @@
-"""Rates, delays and, above all, sentences: each fault is played against a clock of the test's and has to be named."""
+"""Rates, delays and sentences: each fault is played with the test's own clock and must be named."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ INFO = stream("rgb/camera_info", "camera_info")
 
 
 class Bench:
-    """A diagnosis of one camera under a clock that the test turns; stamps are the node's time unless told otherwise."""
+    """A diagnosis of one camera with a clock set by the test; stamps are the node's time unless changed."""
 
     def __init__(self, *streams: Stream, **options) -> None:
         self.now_s = 100.0
@@ -42,7 +42,7 @@ class Bench:
         return START_NS + round(self.now_s * SECOND_NS)
 
     def play(self, seconds: float, *topics: str, period_s: float = 0.1, **offsets_s: float) -> None:
-        """Messages of every topic by period; ``offsets_s`` (by role) are added to their stamps."""
+        """Play messages of every topic at a period; ``offsets_s`` (by role) are added to their stamps."""
         roles = {RGB.topic: "rgb", DEPTH.topic: "depth", POSE.topic: "pose", INFO.topic: "info"}
         for _ in range(round(seconds / period_s)):
             self.now_s += period_s
@@ -51,7 +51,7 @@ class Bench:
                 self.diagnosis.arrived(topic, self.now_ns + offset_ns, self.now_ns)
 
     def found(self, *args, **kwargs) -> dict[str, str]:
-        """Sentences by kind."""
+        """Return the sentences by kind."""
         return {problem.kind: problem.sentence for problem in self.diagnosis.problems(*args, **kwargs)}
 
 

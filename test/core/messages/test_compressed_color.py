@@ -1,4 +1,4 @@
-"""Compressed colour images against OpenCV's encoder; sizes; what is cut, damaged or no colour image is refused."""
+"""Compressed colour images against OpenCV's encoder; sizes; truncated, damaged and other images are refused."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def encoded(kind: str, rgb: np.ndarray, *options: int) -> bytes:
 
 
 def smooth_rgb(height: int = 24, width: int = 36) -> np.ndarray:
-    """Red grows to the right, green downwards, blue against red: swapped channels or axes do not go unnoticed."""
+    """Make an image whose red grows to the right, green downwards, blue to the left: swapped channels or axes show."""
     right, down = np.linspace(20, 230, width), np.linspace(40, 200, height)
     return np.stack(np.broadcast_arrays(right, down[:, None], right[::-1]), axis=2).round().astype(np.uint8)
 

@@ -1,4 +1,4 @@
-"""Compressed depth images against what plain encoders made of known depth; what is cut, damaged or no depth is refused."""
+"""Compressed depth images against plain encoders of known depth; truncated, damaged and other images are refused."""
 
 from __future__ import annotations
 

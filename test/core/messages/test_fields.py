@@ -49,7 +49,7 @@ def test_camera_model():
 
 
 def test_camera_model_of_a_binned_region():
-    """A point is seen at the pixel where reading out the region and binning puts it."""
+    """A point is projected to its pixel after cropping to the region and binning."""
     full = fields.to_intrinsics(ros.camera_info(0, 640, 480, 500.0), "/info")
     part = fields.to_intrinsics(ros.camera_info(0, 640, 480, 500.0, binning=(2, 4), roi=(100, 40, 400, 320)), "/info")
     assert (part.width, part.height) == (160, 100)
@@ -101,7 +101,7 @@ def test_unusable_distortion_is_refused(model, coefficients):
 
 
 def test_distortion_of_a_binned_region_is_that_of_the_whole_image():
-    """Rectifying the part is taking the part of the rectified: coordinates tell the pixels of the whole image apart."""
+    """Rectifying a part gives the part of the rectified whole. Pixels hold their coordinates, so they can be told apart."""
     lens = ("plumb_bob", (-0.2, 0.05, 0.001, 0.002, 0.0))
     whole, part = camera_info(*lens), camera_info(*lens, binning=(2, 2), roi=(100, 40, 400, 320))
     column, row = np.meshgrid(np.arange(640, dtype=np.float32), np.arange(480, dtype=np.float32))

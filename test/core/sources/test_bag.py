@@ -1,4 +1,4 @@
-"""Recordings to posed frames: the round trip, odd and damaged recordings, and the counts of what was dropped."""
+"""Recordings to posed frames: the round trip, unusual and damaged recordings, and counts of drops."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write(path, frames, config=None):
 
 
 def write_messages(path, messages):
-    """A recording of (topic, log time, message or raw bytes with their type)."""
+    """Write a recording of (topic, log time, message or raw bytes with their type)."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start("ros2", "test")

@@ -1,4 +1,4 @@
-"""What a camera is: its model over time, its lens, its separate depth sensor, its transports; and several of them."""
+"""Cameras: the model over time, lens, separate depth sensor and transports, and several cameras."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ def test_each_camera_has_its_namespace_and_its_mounting():
 
 @given(front=st.sets(st.integers(0, 60)), rear=st.sets(st.integers(0, 60)), order=st.randoms(), delay=st.integers(0, 10))
 def test_frames_of_cameras_interleave_by_stamp(front, rear, order, delay):
-    """Depth comes late, each camera's at its own time; all frames come, and none before an earlier one that was there."""
+    """Depth is late by a different time for each camera. All frames come, and none before an earlier one that was there."""
     pairer = two_cameras(max_wait_s=100.0)
     for i in range(61):
         pairer.add_pose(ros.pose(START + i * 100 * MS))

@@ -25,7 +25,7 @@ def pairer(**values) -> FedPairer:
 
 
 def feed(target: FedPairer, stamp_ns: int) -> None:
-    """A complete frame at one stamp."""
+    """Add a complete frame at one stamp."""
     target.add_pose(ros.pose(stamp_ns, (stamp_ns / S, 0.0, 0.0)))
     target.add_depth(ros.image(stamp_ns, "16UC1"))
     target.add_rgb(ros.image(stamp_ns))
@@ -282,7 +282,7 @@ def test_memory_is_bounded_when_only_one_input_is_alive(alive):
 
 
 def reference(rgb, depth, poses, tolerance_ns, gap_ns) -> dict[int, tuple[int, float]]:
-    """What must come out, computed from whole streams: colour stamp -> depth stamp, x position."""
+    """Compute the expected pairs from whole streams: colour stamp -> depth stamp, x position."""
     expected = {}
     for stamp in rgb:
         near = [d for d in depth if abs(d - stamp) <= tolerance_ns]
@@ -316,7 +316,7 @@ def stream(name: str):
     tolerance_ms=st.integers(0, 60),
 )
 def test_random_streams_agree_with_brute_force(rgb, depth, poses, delays_ms, tolerance_ms):
-    """Streams of any rhythm, each delivered with its own delay, end as if all had been known at once."""
+    """Streams of any rhythm and delay give the same pairs as if all messages had been known at once."""
     config = InputConfig(sync_tolerance_s=tolerance_ms / 1000, max_pose_gap_s=0.5, max_wait_s=2.0)
     target = FedPairer(config)
     target.add_camera_info(ros.camera_info())

@@ -1,4 +1,4 @@
-"""Poses and extrinsics from each source: who waits for what, and what is said when it does not come."""
+"""Poses and extrinsics from each source: what images wait for, and the reasons when it does not come."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ HALF = float(np.sqrt(0.5))
 
 
 class Setup:
-    """A pairer with a camera model, and the transforms in which it looks up."""
+    """A pairer with a camera model, and its transforms."""
 
     def __init__(self, **values) -> None:
         config = InputConfig(**values)

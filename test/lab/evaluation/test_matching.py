@@ -1,4 +1,4 @@
-"""Nearest voxels against brute force, and the mode as torch takes it; the order of voxels plays no role."""
+"""Nearest voxels against brute force, and the mode against torch, for any order of voxels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def keys_of(voxels) -> np.ndarray:
 
 
 def nearest_by_brute_force(position, voxels, k):
-    """The k nearest voxels, of equally near ones the lexicographically lowest."""
+    """Return the k nearest voxels, of equally near ones the lexicographically lowest."""
     return sorted(voxels, key=lambda key: (sum((a - b) ** 2 for a, b in zip(position, key, strict=True)), key))[:k]
 
 

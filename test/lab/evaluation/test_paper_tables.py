@@ -1,4 +1,4 @@
-"""The paper's numbers are all here, and agree with one another where the paper gives one twice."""
+"""All numbers of the paper are there, and agree where the paper gives them twice."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The simulated building: what is labelled is what is there, and a robot could drive through it."""
+"""The simulated building: labels match the geometry, and a robot can drive through it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BODY_M = 0.15
 
 
 def instance_boxes_m(world: BoxWorld) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corners of every instance: two (instances + 1, 3), the first without meaning."""
+    """Return lower and upper corners of every instance: two (instances + 1, 3), the first row without meaning."""
     instance = world.truth.instance_of_part[world.part]
     low, high = np.full((instance.max() + 1, 3), np.inf), np.full((instance.max() + 1, 3), -np.inf)
     np.minimum.at(low, instance, world.low_m)
