@@ -18,7 +18,7 @@ from fus3dmaps_core.messages.image_files import decode_pixels, read_header
 _EPOCH_NS = 1_356_998_400 * 1_000_000_000  # 1 January 2013; for files without times, any time but 0 (unset) would do.
 
 
-def stamp_ns(number: int, rate_hz: float) -> int:
+def frame_stamp_ns(number: int, rate_hz: float) -> int:
     """Make a stamp for a frame number of a sequence without times, nanoseconds."""
     return _EPOCH_NS + round(number * 1e9 / rate_hz)
 

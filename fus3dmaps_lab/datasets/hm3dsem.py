@@ -14,6 +14,7 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -22,7 +23,6 @@ from fus3dmaps_lab.datasets.checked_files import (
     read_text,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.poses import FROM_OPENGL
 from fus3dmaps_lab.datasets.protocols import Labels
@@ -73,7 +73,7 @@ class Hm3dSem(ImageSequence):
             T_world_optical = checked_pose(read_matrix(pose_file, 4), f"'{pose_file}'") @ FROM_OPENGL
             depth = require_file(walk / "depth" / color.name)
             ids = _semantic_file(walk / "semantic", color.stem) if semantic else None
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T_world_optical, ids, ids))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T_world_optical, ids, ids))
         self._table, labels = np.zeros(1, np.int32), Labels()
         if semantic and objects_file is not None:
             self._table, labels = _classes_of(objects_file, _mapping_file(walk, categories))

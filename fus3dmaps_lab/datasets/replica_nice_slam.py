@@ -11,6 +11,7 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -18,7 +19,6 @@ from fus3dmaps_lab.datasets.checked_files import (
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 from fus3dmaps_lab.datasets.replica_labels import ReplicaClasses, read_classes, read_labelled_mesh
@@ -64,7 +64,7 @@ class ReplicaNiceSlam(ImageSequence):
         for line, (number, color) in enumerate(colors.items()):
             depth = require_file(results / f"depth{number:06d}.png")
             T = checked_pose(poses[line], f"'{trajectory}' pose {line + 1}")
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T))
         K, self._units_per_m = _camera(require_file(directory.resolve().parent / "cam_params.json", "the camera"))
         intrinsics = camera_model(K, image_size(frames[0].rgb), directory.resolve().parent / "cam_params.json")
         folder = Path(habitat) if habitat else directory / "habitat"

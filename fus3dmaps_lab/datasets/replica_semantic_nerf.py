@@ -11,13 +11,13 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.protocols import Labels
 from fus3dmaps_lab.datasets.replica_labels import read_classes
@@ -66,7 +66,7 @@ class ReplicaSemanticNerf(ImageSequence):
         for line, (number, color) in enumerate(colors.items()):
             frames.append(
                 FrameFiles(
-                    stamp_ns(number, _RATE_HZ),
+                    frame_stamp_ns(number, _RATE_HZ),
                     color,
                     require_file(folder / "depth" / f"depth_{number}.png"),
                     checked_pose(poses[line], f"'{trajectory}' pose {line + 1}"),

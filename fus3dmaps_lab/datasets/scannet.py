@@ -13,6 +13,7 @@ from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -20,7 +21,6 @@ from fus3dmaps_lab.datasets.checked_files import (
     read_text,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.ply import read_ply
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
@@ -86,7 +86,7 @@ class ScanNet(ImageSequence):
                 None if folder is None else require_file(folder / f"{number}.png")
                 for folder in (label_images, instance_images)
             )
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), colors[number], depth, T, label, instance))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), colors[number], depth, T, label, instance))
         self._mesh = scan / f"{scan.name}_vh_clean_2.labels.ply"
         if truth == "mesh":
             require_file(self._mesh, "vertices with NYU40 labels")

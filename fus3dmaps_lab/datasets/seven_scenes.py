@@ -11,13 +11,13 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
     read_matrix,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.sequence import FrameFiles, ImageSequence, every
 
@@ -57,7 +57,7 @@ class SevenScenes(ImageSequence):
             stem = directory / f"frame-{number:06d}"
             depth, pose = (require_file(stem.with_name(stem.name + end)) for end in (".depth.png", ".pose.txt"))
             T = checked_pose(read_matrix(pose, 4), f"'{pose}'")
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T))
         intrinsics_file = directory / "camera-intrinsics.txt"
         K = read_matrix(intrinsics_file, 3) if intrinsics_file.exists() else _NOMINAL_K
         intrinsics = camera_model(K, image_size(frames[0].rgb), intrinsics_file)

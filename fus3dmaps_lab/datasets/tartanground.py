@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_json,
@@ -17,7 +18,6 @@ from fus3dmaps_lab.datasets.checked_files import (
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.poses import FROM_FORWARD_RIGHT_DOWN, pose_of_quaternion
 from fus3dmaps_lab.datasets.protocols import Labels
@@ -73,7 +73,7 @@ class TartanGround(ImageSequence):
             T_ned_optical = pose_of_quaternion(rows[line], f"'{pose_file}' pose {line + 1}") @ FROM_FORWARD_RIGHT_DOWN
             frames.append(
                 FrameFiles(
-                    stamp_ns(number, _RATE_HZ),
+                    frame_stamp_ns(number, _RATE_HZ),
                     color,
                     require_file(folder / "depth_lcam_front" / f"{stem}_depth.png"),
                     T_ned_optical,
