@@ -24,7 +24,7 @@ from rosgraph_msgs.msg import Clock
 
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
-from fus3dmaps_core.recordings.storage import RawMessage
+from fus3dmaps_core.recordings.recorded_files import RawMessage
 from fus3dmaps_ros.node.refusals import REFUSALS
 from fus3dmaps_ros.topics.transport import enlarge_shared_memory
 

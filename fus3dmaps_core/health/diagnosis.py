@@ -1,4 +1,4 @@
-"""How the mapping fares, from what its parts say as they work: rates, delays, drops, and what is wrong in words."""
+"""State of the running mapping: rates, delays, drops, and sentences about what is wrong."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_core.health import input_problems as problems
-from fus3dmaps_core.health import mapping_problems
-from fus3dmaps_core.health.input_problems import Level, Offer, Part, Problem, Stream
+from fus3dmaps_core.health import input_problems, mapping_problems
+from fus3dmaps_core.health.input_problems import Level, Offer, Part, Problem
 from fus3dmaps_core.health.mapping_problems import MIB, Latency, MemoryState, Pace
-from fus3dmaps_core.health.recent import SlidingWindow
+from fus3dmaps_core.health.recent_numbers import RecentNumbers
+from fus3dmaps_core.sources.streams import Stream
 
 _STAMPS = 500  # Ten seconds of images at 50 Hz.
 _POSES = 100
@@ -24,7 +24,7 @@ _POSES = 100
 
 @dataclass(frozen=True)
 class MapSizes:
-    """How large the map is.
+    """Size of the map.
 
     Attributes:
         voxels: Number of voxels.
@@ -42,10 +42,10 @@ class PartReport:
     """The state of one part.
 
     Attributes:
-        part: Which one.
-        level: The worst of its problems.
-        message: Its problems in words, or a line on how it fares.
-        values: Figures for people, by name.
+        part: The part.
+        level: The highest level of its problems.
+        message: Its problems in words, or a line about its state.
+        values: Figures in readable form, by name.
     """
 
     part: Part
@@ -56,17 +56,17 @@ class PartReport:
 
 @dataclass
 class _Arrivals:
-    recent: SlidingWindow
+    recent: RecentNumbers
     last_s: float | None = None
     stamps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=_STAMPS))
     ages_s: deque[float] = field(default_factory=lambda: deque(maxlen=20))
 
 
 class Diagnosis:
-    """Takes events as they happen and says on request how things stand. Thread-safe; events cost microseconds.
+    """Collects events while the node maps and reports the state on request. Thread-safe; an event costs microseconds.
 
-    Rates, latencies and shares are those of a sliding window. Time is a steady clock's: a paused or jumping ``/clock`` must
-    not hide what is wrong. The node's own clock only serves to compare stamps with it.
+    Rates, latencies and shares are those of the last ``recent_s`` seconds of a steady clock, because a paused or jumping
+    ``/clock`` must not hide problems. Stamps alone are compared with the node's own clock.
     """
 
     def __init__(
@@ -77,55 +77,47 @@ class Diagnosis:
         max_wait_s: float,
         use_sim_time: bool = False,
         silence_s: float = 5.0,
-        window_s: float = 10.0,
+        recent_s: float = 10.0,
         clock_tolerance_s: float = 10.0,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Start with nothing seen.
+        """Start without events.
 
         Args:
-            streams: The inputs whose messages :meth:`arrived` will tell of.
+            streams: The inputs whose messages are reported by :meth:`arrived`.
             sync_tolerance_s: ``input.sync_tolerance_s``.
             max_wait_s: ``input.max_wait_s``.
             use_sim_time: Whether the node's clock is ``/clock``.
-            silence_s: A topic without a message for so long is named.
-            window_s: Length of the sliding window.
-            clock_tolerance_s: Stamps may be so far from the node's clock.
-            clock: Seconds of a clock that never goes back.
+            silence_s: Time without a message after which a topic is reported, seconds.
+            recent_s: Time over which rates, latencies and shares are computed, seconds.
+            clock_tolerance_s: Greatest difference between stamps and the node's clock, seconds.
+            clock: Clock that never goes back, seconds.
         """
         self._streams = {stream.topic: stream for stream in streams}
         self._sync_tolerance_s = sync_tolerance_s
         self._max_wait_s = max_wait_s
         self._use_sim_time = use_sim_time
         self._silence_s = silence_s
-        self._window_s = window_s
+        self._recent_s = recent_s
         self._clock_tolerance_s = clock_tolerance_s
         self._clock = clock
         self._lock = threading.Lock()
-        self._forget()
-
-    def _forget(self) -> None:
         self._started_s = self._last_offered_s = self._waiting_since_s = self._clock()
-        self._arrivals = {topic: _Arrivals(SlidingWindow(self._window_s)) for topic in self._streams}
-        self._offered = SlidingWindow(self._window_s)
-        self._mapped = SlidingWindow(self._window_s)
+        self._arrivals = {topic: _Arrivals(RecentNumbers(self._recent_s)) for topic in self._streams}
+        self._offered = RecentNumbers(self._recent_s)
+        self._mapped = RecentNumbers(self._recent_s)
         self._waiting = 0
-        self._stages: dict[str, SlidingWindow] = {}
+        self._stages: dict[str, RecentNumbers] = {}
         self._drops: Counter[str] = Counter()
         self._last_drop: dict[str, str] = {}
-        self._recent_drops: dict[str, SlidingWindow] = {}
+        self._recent_drops: dict[str, RecentNumbers] = {}
         self._camera_problems: dict[str, Problem | None] = {}
         self._depth_problems: dict[str, Problem | None] = {}
         self._poses: deque[tuple[NDArray[np.float64], float]] = deque(maxlen=_POSES)
         self._pose_topic = ""
 
-    def restart(self) -> None:
-        """Forget everything, as when mapping is started after a pause: silence counts from now."""
-        with self._lock:
-            self._forget()
-
     def arrived(self, topic: str, stamp_ns: int, now_ns: int) -> None:
-        """A message came.
+        """Note that a message came.
 
         Args:
             topic: Name of one of the streams.
@@ -141,7 +133,11 @@ class Diagnosis:
             arrivals.ages_s.append((now_ns - stamp_ns) / 1e9)
 
     def offered(self, waiting: int) -> None:
-        """A complete frame was handed to mapping, and so many wait now."""
+        """Note that a complete frame was handed to mapping.
+
+        Args:
+            waiting: Frames that wait now.
+        """
         now_s = self._clock()
         with self._lock:
             self._offered.add(now_s)
@@ -151,10 +147,10 @@ class Diagnosis:
             self._waiting = waiting
 
     def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
-        """A frame has been dealt with, mapped or not.
+        """Note that the work on a frame has ended, whether it was mapped or not.
 
         Args:
-            durations_s: Time of each stage, seconds; empty for a frame that was no keyframe or failed.
+            durations_s: Time of each stage, seconds; empty for a frame that failed or was no keyframe.
             waiting: Frames that wait now.
         """
         now_s = self._clock()
@@ -162,27 +158,27 @@ class Diagnosis:
             self._waiting_since_s = now_s
             self._waiting = waiting
             for stage, duration_s in durations_s.items():
-                self._stages.setdefault(stage, SlidingWindow(self._window_s)).add(now_s, duration_s)
+                self._stages.setdefault(stage, RecentNumbers(self._recent_s)).add(now_s, duration_s)
             if durations_s:
                 self._mapped.add(now_s, sum(durations_s.values()))
 
     def dropped(self, reason: str, sentence: str, number: int = 1) -> None:
-        """Messages or frames were dropped.
+        """Note that messages or frames were dropped.
 
         Args:
-            reason: Machine-readable cause, snake_case; ``queue_full`` is that mapping is too slow.
-            sentence: What happened to the latest of them.
-            number: How many.
+            reason: Machine-readable cause, snake_case; ``queue_full`` means that mapping is too slow.
+            sentence: Explanation of the latest of them.
+            number: Number of drops.
         """
         now_s = self._clock()
         with self._lock:
             self._drops[reason] += number
             self._last_drop[reason] = sentence
-            self._recent_drops.setdefault(reason, SlidingWindow(self._window_s)).add(now_s, number)
+            self._recent_drops.setdefault(reason, RecentNumbers(self._recent_s)).add(now_s, number)
 
     def camera(self, topic: str, intrinsics: Intrinsics) -> None:
-        """A camera model came or changed."""
-        problem = problems.unlikely_intrinsics(topic, intrinsics)
+        """Note that a camera model came or changed."""
+        problem = input_problems.unlikely_intrinsics(topic, intrinsics)
         with self._lock:
             self._camera_problems[topic] = problem
 
@@ -195,46 +191,46 @@ class Diagnosis:
         encoding: str,
         pose_topic: str,
     ) -> None:
-        """A keyframe was decoded.
+        """Note that a keyframe was decoded.
 
         Args:
             T_world_camera: (4, 4) float64, its pose.
-            depth_m: (H, W) float32 metres, not valid where 0 or not finite.
-            depth_topic: Where depth comes from.
+            depth_m: (H, W) float32 metres, not valid if 0 or not finite.
+            depth_topic: Topic of depth.
             encoding: Encoding of the depth message.
-            pose_topic: Where the pose comes from.
+            pose_topic: Topic of the pose.
         """
-        median_m, spread = problems.depth_statistics(depth_m)
-        problem = problems.unlikely_depth(depth_topic, encoding, median_m)
+        median_m, spread = input_problems.depth_statistics(depth_m)
+        problem = input_problems.unlikely_depth(depth_topic, encoding, median_m)
         with self._lock:
             self._depth_problems[depth_topic] = problem
             self._poses.append((T_world_camera, spread))
             self._pose_topic = pose_topic
 
     def rates_hz(self) -> dict[str, float]:
-        """Messages per second of each topic."""
+        """Compute the messages per second of each topic."""
         with self._lock:
             now_s = self._clock()
             return {topic: self._rate_hz(arrivals.recent, now_s) for topic, arrivals in self._arrivals.items()}
 
     def latencies(self) -> dict[str, Latency]:
-        """How long each stage took."""
+        """Compute the times of each stage."""
         with self._lock:
             return self._latencies(self._clock())
 
     def drops(self) -> Counter[str]:
-        """Drops by reason since the start."""
+        """Count the drops since the start, by reason."""
         with self._lock:
             return Counter(self._drops)
 
     def problems(
         self, offers: Mapping[str, Sequence[Offer]] | None = None, memory: Sequence[MemoryState] = ()
     ) -> list[Problem]:
-        """What is wrong now, inputs first.
+        """List what is wrong now, inputs first.
 
         Args:
-            offers: Publishers of each topic; None where they are not known.
-            memory: How full each memory is.
+            offers: Publishers of each topic; None if they are not known.
+            memory: Use of each memory.
         """
         with self._lock:
             now_s = self._clock()
@@ -245,12 +241,12 @@ class Diagnosis:
     def report(
         self, sizes: MapSizes, memory: Sequence[MemoryState] = (), offers: Mapping[str, Sequence[Offer]] | None = None
     ) -> list[PartReport]:
-        """The state of inputs, mapping, map and memory, in that order.
+        """Report the state of inputs, mapping, map and memory, in that order.
 
         Args:
-            sizes: How large the map is.
-            memory: How full each memory is.
-            offers: Publishers of each topic; None where they are not known.
+            sizes: Size of the map.
+            memory: Use of each memory.
+            offers: Publishers of each topic; None if they are not known.
         """
         found = self.problems(offers, memory)
         rates_hz, latencies, drops = self.rates_hz(), self.latencies(), self.drops()
@@ -286,19 +282,19 @@ class Diagnosis:
         return reports
 
     def _seen_s(self, now_s: float) -> float:
-        """How much of the window has passed yet, seconds; never zero."""
-        return max(min(self._window_s, now_s - self._started_s), 1e-9)
+        """Return the time over which recent numbers came, seconds: less than ``recent_s`` after the start, never zero."""
+        return max(min(self._recent_s, now_s - self._started_s), 1e-9)
 
-    def _rate_hz(self, window: SlidingWindow, now_s: float) -> float:
-        return len(window.numbers(now_s)) / self._seen_s(now_s)
+    def _rate_hz(self, recent: RecentNumbers, now_s: float) -> float:
+        return len(recent.numbers(now_s)) / self._seen_s(now_s)
 
     def _latencies(self, now_s: float) -> dict[str, Latency]:
-        durations_s = {stage: window.numbers(now_s) for stage, window in self._stages.items()}
+        durations_s = {stage: recent.numbers(now_s) for stage, recent in self._stages.items()}
         return {stage: Latency(len(s), sum(s) / len(s), max(s)) for stage, s in durations_s.items() if s}
 
     def _recent_drop(self, reason: str, now_s: float) -> int:
-        window = self._recent_drops.get(reason)
-        return round(sum(window.numbers(now_s))) if window else 0
+        recent = self._recent_drops.get(reason)
+        return round(sum(recent.numbers(now_s))) if recent else 0
 
     def _pace(self, now_s: float) -> Pace:
         offered, unmapped = len(self._offered.numbers(now_s)), self._recent_drop("queue_full", now_s)
@@ -319,23 +315,23 @@ class Diagnosis:
             silent_s = now_s - (self._started_s if arrivals.last_s is None else arrivals.last_s)
             offered = None if offers is None else offers.get(topic, ())
             if silent_s >= self._silence_s and not (stream.once and arrivals.last_s is not None):
-                found.append(problems.silence(stream, silent_s, offered))
+                found.append(input_problems.silence(stream, silent_s, offered))
                 continue
             if offered and arrivals.last_s is not None:
-                found.append(problems.partly_unheard(stream, offered))
+                found.append(input_problems.partly_unheard(stream, offered))
             if arrivals.last_s is not None and not stream.once:
                 live[topic] = arrivals
         found += self._stamp_problems(live)
         ages_s = {topic: float(np.median(arrivals.ages_s)) for topic, arrivals in live.items()}
-        found.append(problems.clock_mismatch(ages_s, self._clock_tolerance_s, self._use_sim_time))
+        found.append(input_problems.clock_mismatch(ages_s, self._clock_tolerance_s, self._use_sim_time))
         found += [*self._camera_problems.values(), *self._depth_problems.values()]
         if self._poses:
             poses_4x4, spread = zip(*self._poses, strict=True)
-            found.append(problems.not_optical(np.stack(poses_4x4), np.array(spread), self._pose_topic))
+            found.append(input_problems.not_optical(np.stack(poses_4x4), np.array(spread), self._pose_topic))
         return [problem for problem in found if problem is not None]
 
     def _stamp_problems(self, live: Mapping[str, _Arrivals]) -> list[Problem | None]:
-        """What the stamps of streams say that should go together; the n-th of colour and of depth are of one camera."""
+        """Compare the stamps of streams that belong together; the n-th colour and n-th depth stream share a camera."""
         roles = {role: [s for s in self._streams.values() if s.role == role] for role in ("rgb", "depth", "pose")}
         pairs = [*zip(roles["rgb"], roles["depth"], strict=False)]
         pairs += [(rgb, pose) for rgb in roles["rgb"] for pose in roles["pose"]]
@@ -345,8 +341,8 @@ class Diagnosis:
                 continue
             rgb_ns, other_ns = live[rgb.topic].stamps_ns, live[other.topic].stamps_ns
             if other.role == "depth":
-                found.append(problems.stamp_difference(rgb, other, rgb_ns, other_ns, self._sync_tolerance_s))
-            found.append(problems.lag(rgb, other, rgb_ns[-1], other_ns[-1], self._max_wait_s))
+                found.append(input_problems.stamp_difference(rgb, other, rgb_ns, other_ns, self._sync_tolerance_s))
+            found.append(input_problems.lag(rgb, other, rgb_ns[-1], other_ns[-1], self._max_wait_s))
         return found
 
     def _drop_problems(self, now_s: float) -> list[Problem]:

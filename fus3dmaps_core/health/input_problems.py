@@ -1,6 +1,7 @@
-"""What can be wrong with the inputs of a map, each as a rule that gives a sentence: symptom, likely cause, remedy.
+"""Rules that find problems of the map's inputs. Each describes symptom, likely cause and remedy in a sentence.
 
-The rules are pure: numbers in, a :class:`Problem` or None out. :mod:`fus3dmaps_core.health.diagnosis` keeps the numbers.
+The rules are pure functions: they take numbers and return a :class:`Problem` or None. The numbers are kept by
+:mod:`fus3dmaps_core.health.diagnosis`.
 """
 
 from __future__ import annotations
@@ -15,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.frame import Intrinsics
+from fus3dmaps_core.sources.streams import Qos, Stream
 
 Part = Literal["inputs", "mapping", "map", "memory"]
 
 _MIN_PAIRS = 5
-_FOCAL_RANGE = (0.2, 5.0)  # Shares of the width: fields of view of 136 and of 11 degrees.
+_FOCAL_RANGE = (0.2, 5.0)  # Shares of the width, for fields of view of 136 and 11 degrees.
 _CENTER_RANGE = (0.25, 0.75)
 _MIN_MEDIAN_16BIT_M = 0.05
 _MAX_MEDIAN_32BIT_M = 100.0
@@ -32,7 +34,7 @@ _MIN_DEPTH_SPREAD = 0.15
 
 
 class Level(IntEnum):
-    """How bad it is; the values of ``diagnostic_msgs/DiagnosticStatus``."""
+    """Severity, with the values of ``diagnostic_msgs/DiagnosticStatus``."""
 
     OK = 0
     WARN = 1
@@ -45,8 +47,8 @@ class Problem:
     """Something that is wrong.
 
     Attributes:
-        part: What it concerns.
-        level: WARN where mapping goes on worse than it could, ERROR where it cannot.
+        part: The part of the system that it concerns.
+        level: WARN if mapping goes on but worse than it could, ERROR if it cannot go on.
         kind: Machine-readable name, snake_case.
         sentence: Symptom, likely cause and remedy; names topics and parameters.
     """
@@ -63,8 +65,8 @@ class Offer:
 
     Attributes:
         node: Name of its node with namespace.
-        reliability: ``RELIABLE`` or ``BEST_EFFORT``; anything else is taken to match.
-        durability: ``TRANSIENT_LOCAL`` or ``VOLATILE``; anything else is taken to match.
+        reliability: ``RELIABLE`` or ``BEST_EFFORT``; any other value counts as a match.
+        durability: ``TRANSIENT_LOCAL`` or ``VOLATILE``; any other value counts as a match.
     """
 
     node: str
@@ -72,54 +74,31 @@ class Offer:
     durability: str
 
 
-@dataclass(frozen=True)
-class Stream:
-    """An input of the map.
-
-    Attributes:
-        topic: Its name, as messages and sentences give it.
-        role: What it carries.
-        reliability: What the subscription asks for: ``RELIABLE``, ``BEST_EFFORT`` or ``BEST_AVAILABLE``.
-        durability: What the subscription asks for: ``TRANSIENT_LOCAL``, ``VOLATILE`` or ``BEST_AVAILABLE``.
-        topic_parameter: Parameter that names the topic.
-        qos_parameter: Parameter that chooses its QoS profile.
-        once: One message is enough, as for a latched camera model: only its absence from the start is a problem.
-    """
-
-    topic: str
-    role: Literal["rgb", "depth", "pose", "camera_info"]
-    reliability: str
-    durability: str
-    topic_parameter: str
-    qos_parameter: str
-    once: bool = False
-
-
-def unheard(stream: Stream, offer: Offer) -> str:
-    """Why the subscription does not hear a publisher, by the rules of DDS; empty where it does."""
+def unheard(asked: Qos, offer: Offer) -> str:
+    """Say why a subscription does not hear a publisher, by the rules of DDS; empty if it does."""
     reasons = []
-    if stream.reliability == "RELIABLE" and offer.reliability == "BEST_EFFORT":
+    if asked.reliability == "RELIABLE" and offer.reliability == "BEST_EFFORT":
         reasons.append("offers BEST_EFFORT, we ask RELIABLE")
-    if stream.durability == "TRANSIENT_LOCAL" and offer.durability == "VOLATILE":
+    if asked.durability == "TRANSIENT_LOCAL" and offer.durability == "VOLATILE":
         reasons.append("offers VOLATILE, we ask TRANSIENT_LOCAL")
     return " and ".join(reasons)
 
 
 def silence(stream: Stream, silent_s: float, offers: Sequence[Offer] | None) -> Problem:
-    """No message on a topic.
+    """Report that no messages come on a topic.
 
     Args:
         stream: The topic.
-        silent_s: Since when, seconds.
-        offers: Its publishers; None where they are not known.
+        silent_s: Time without a message, seconds.
+        offers: Its publishers; None if they are not known.
     """
     symptom = f"no message on {stream.topic} for {silent_s:.0f} s"
     if offers is None:
         return Problem("inputs", Level.ERROR, "silence", symptom)
     if not offers:
-        sentence = f"{symptom}: it has no publisher. Does the driver run, and is '{stream.topic_parameter}' the right name?"
+        sentence = f"{symptom}: it has no publisher. Does the driver run, and is '{stream.parameter}' the right name?"
         return Problem("inputs", Level.ERROR, "no_publisher", sentence)
-    reasons = [unheard(stream, offer) for offer in offers]
+    reasons = [unheard(stream.qos, offer) for offer in offers]
     if all(reasons):
         who = "its publisher" if len(offers) == 1 else f"the first of its {len(offers)} publishers"
         sentence = f"{symptom}; {who} {reasons[0]}: set parameter '{stream.qos_parameter}' to best_available or sensor_data"
@@ -133,8 +112,8 @@ def silence(stream: Stream, silent_s: float, offers: Sequence[Offer] | None) -> 
 
 
 def partly_unheard(stream: Stream, offers: Sequence[Offer]) -> Problem | None:
-    """Messages come, but not from every publisher of the topic."""
-    deaf = [(offer, reason) for offer in offers if (reason := unheard(stream, offer))]
+    """Report publishers of a topic whose messages do not arrive, although those of others do."""
+    deaf = [(offer, reason) for offer in offers if (reason := unheard(stream.qos, offer))]
     if not deaf:
         return None
     offer, reason = deaf[0]
@@ -148,16 +127,16 @@ def partly_unheard(stream: Stream, offers: Sequence[Offer]) -> Problem | None:
 def stamp_difference(
     rgb: Stream, depth: Stream, rgb_ns: Sequence[int], depth_ns: Sequence[int], tolerance_s: float
 ) -> Problem | None:
-    """Depth is not of the moment of colour: the median difference to the nearest depth stamp is beyond the tolerance.
+    """Report that the median difference between colour and depth stamps is greater than the tolerance.
 
-    Streams whose constant offset is a multiple of the frame period look synchronous, to this rule as to any other; one that
-    is seconds behind is :func:`lag`'s.
+    Streams with a constant offset of whole frame periods look synchronous to any rule on stamps. An offset of seconds is
+    found by :func:`lag`.
 
     Args:
         rgb: The colour stream.
         depth: The depth stream.
-        rgb_ns: Its latest stamps, nanoseconds.
-        depth_ns: Its latest stamps, nanoseconds.
+        rgb_ns: Latest stamps of colour, nanoseconds.
+        depth_ns: Latest stamps of depth, nanoseconds.
         tolerance_s: ``input.sync_tolerance_s``.
     """
     apart_s = _apart_s(np.sort(np.array(rgb_ns)), np.sort(np.array(depth_ns)))
@@ -176,14 +155,14 @@ def stamp_difference(
 
 
 def lag(rgb: Stream, other: Stream, rgb_ns: int, other_ns: int, max_wait_s: float) -> Problem | None:
-    """The newest image and the newest pose or depth image, both just arrived, are of times far apart.
+    """Report that the newest colour image and the newest pose or depth image have stamps far apart.
 
     Args:
         rgb: The colour stream.
         other: The stream of poses or depth.
         rgb_ns: Newest stamp of colour, nanoseconds.
         other_ns: Newest stamp of the other, nanoseconds.
-        max_wait_s: ``input.max_wait_s``; images that wait longer are dropped, and half of it is a warning.
+        max_wait_s: ``input.max_wait_s``. Images that wait longer are dropped; half of it gives a warning.
     """
     lag_s = (rgb_ns - other_ns) / 1e9
     if abs(lag_s) <= max_wait_s / 2.0:
@@ -204,11 +183,11 @@ def lag(rgb: Stream, other: Stream, rgb_ns: int, other_ns: int, max_wait_s: floa
 
 
 def clock_mismatch(ages_s: Mapping[str, float], tolerance_s: float, use_sim_time: bool) -> Problem | None:
-    """Stamps are far from the node's clock, which other nodes and RViz go by.
+    """Report stamps that are far from the node's clock, which other nodes and RViz use.
 
     Args:
         ages_s: How far the stamps of each topic lie behind the node's clock, seconds; negative for the future.
-        tolerance_s: Differences up to here are delays.
+        tolerance_s: Greatest difference that counts as a delay.
         use_sim_time: Whether the node's clock is ``/clock``.
     """
     far = {topic: age_s for topic, age_s in ages_s.items() if abs(age_s) > tolerance_s}
@@ -226,7 +205,7 @@ def clock_mismatch(ages_s: Mapping[str, float], tolerance_s: float, use_sim_time
 
 
 def unlikely_intrinsics(topic: str, intrinsics: Intrinsics) -> Problem | None:
-    """A camera model that does not fit its image: of another resolution, of another camera, or not calibrated.
+    """Report a camera model that does not fit its image: of another resolution or camera, or not calibrated.
 
     Args:
         topic: Where the model comes from.
@@ -253,12 +232,12 @@ def unlikely_intrinsics(topic: str, intrinsics: Intrinsics) -> Problem | None:
 
 
 def unlikely_depth(topic: str, encoding: str, median_m: float) -> Problem | None:
-    """Depth in another unit than its encoding says (REP-118).
+    """Report depth that seems to have another unit than its encoding says (REP-118).
 
     Args:
         topic: Where depth comes from.
         encoding: ``16UC1``, ``mono16`` or ``32FC1``.
-        median_m: Median of the valid readings as they were understood, metres.
+        median_m: Median of the valid readings as they were decoded, metres.
     """
     if encoding in ("16UC1", "mono16") and median_m < _MIN_MEDIAN_16BIT_M:
         sentence = (
@@ -276,19 +255,19 @@ def unlikely_depth(topic: str, encoding: str, median_m: float) -> Problem | None
 
 
 def not_optical(T_world_camera: NDArray[np.float64], depth_spread: NDArray[np.float64], pose_topic: str) -> Problem | None:
-    """Poses that look like those of a body frame (x forward, z up) where the optical frame's (z forward) are needed.
+    """Report poses that look like those of a body frame (x forward, z up) instead of an optical frame (z forward).
 
-    A body that drives about keeps its z axis upright while it turns. A camera's z axis is where it looks: upright it would
-    look at the ceiling, and a ceiling, square to that axis, has nearly one depth. So the frame is doubted when, over the
-    last poses, nearly all z axes point along the world's z, the poses turn about it, and depth is not flat.
+    A driving body turns while its z axis stays upright. An optical frame with an upright z axis would look at the ceiling,
+    and would see nearly the same depth everywhere. So poses are reported if nearly all of the latest z axes point along the
+    world's z, the poses turn about it, and depth is not flat.
 
-    Limits: the world's z must point up (REP-103, 105). A world that is the first camera's optical frame is not doubted
-    unless that camera rolls by 45 degrees while looking ahead. A robot that never turns, a body frame with z down, and one
-    tilted by more than 25 degrees are not noticed. A camera that does look up at open beams is doubted without cause.
+    Limits: the world's z must point up (REP-103, 105). If the world is the first camera's optical frame, nothing is reported
+    unless that camera rolls by 45 degrees while looking ahead. A robot that never turns, a body frame with z down and one
+    tilted by more than 25 degrees are missed. A camera that really looks up at open beams is reported without cause.
 
     Args:
-        T_world_camera: (n, 4, 4) float64, latest poses, moved between one another.
-        depth_spread: (n,) float64, spread of the depth image of each, (p90 - p10) / median; nan where it has none.
+        T_world_camera: (n, 4, 4) float64, latest poses, with motion between them.
+        depth_spread: (n,) float64, spread of the depth image of each, (p90 - p10) / median; nan if it has none.
         pose_topic: Where the poses come from.
     """
     if len(T_world_camera) < _MIN_POSES:
@@ -309,10 +288,10 @@ def not_optical(T_world_camera: NDArray[np.float64], depth_spread: NDArray[np.fl
 
 
 def depth_statistics(depth_m: NDArray[np.float32]) -> tuple[float, float]:
-    """Median (metres) and spread, (p90 - p10) / median, of the valid readings of a depth image; nan where it has none.
+    """Compute median (metres) and spread, (p90 - p10) / median, of a depth image's valid readings; nan if it has none.
 
     Args:
-        depth_m: (H, W) float32 metres; 0 and what is not finite are not valid. Every eighth row and column is looked at.
+        depth_m: (H, W) float32 metres; 0 and non-finite values are not valid. Only every eighth row and column is used.
     """
     readings = depth_m[::8, ::8]
     readings = readings[np.isfinite(readings) & (readings > 0.0)]
@@ -323,18 +302,18 @@ def depth_statistics(depth_m: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _apart_s(first_ns: NDArray[np.int64], second_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """How far each stamp of the slower stream is from the nearest of the faster one, seconds; both are sorted."""
+    """Compute how far each stamp of the slower stream is from the nearest of the faster one, seconds; both are sorted."""
     if min(first_ns.size, second_ns.size) < 2:
         return np.empty(0)
-    # A driver may give colour at 30 Hz and depth at 5: that most colour images have no depth then is no fault of stamps.
+    # A driver may give colour at 30 Hz and depth at 5 Hz. Most colour images have no depth then; the stamps are fine.
     slow_ns, fast_ns = sorted((first_ns, second_ns), key=lambda stamps: -float(stamps[-1] - stamps[0]) / (stamps.size - 1))
-    # Only where the spans overlap: stamps outside have lost their partners, wait for them, or are of another clock.
+    # Only where both streams have stamps: outside, partners are missing, still to come, or on another clock.
     compared_ns = slow_ns[(slow_ns >= fast_ns[0]) & (slow_ns <= fast_ns[-1])]
     return np.asarray(np.abs(np.subtract.outer(compared_ns, fast_ns)).min(axis=1) / 1e9, dtype=np.float64)
 
 
 def _widest_turn_rad(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """The smallest arc that holds all headings, radians, from their components."""
+    """Compute the smallest arc that holds all headings, radians, from their components."""
     headings = np.sort(np.arctan2(y, x))
     gaps = np.diff(headings, append=headings[0] + 2.0 * math.pi)
     return 2.0 * math.pi - float(gaps.max())

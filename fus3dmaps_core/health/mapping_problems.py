@@ -1,4 +1,4 @@
-"""What can be wrong with the mapping itself, by the same kind of rules as :mod:`fus3dmaps_core.health.input_problems`."""
+"""Rules that find problems of the mapping itself, like those of :mod:`fus3dmaps_core.health.input_problems`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NEAR_BUDGET = 0.9
 
 @dataclass(frozen=True)
 class Latency:
-    """How long a stage took.
+    """Times that a stage took.
 
     Attributes:
         count: How often it ran.
@@ -30,7 +30,7 @@ class Latency:
 
 @dataclass(frozen=True)
 class MemoryState:
-    """How full a memory is.
+    """Use of one memory.
 
     Attributes:
         name: ``host`` or a torch device.
@@ -45,15 +45,15 @@ class MemoryState:
 
 @dataclass(frozen=True)
 class Pace:
-    """How mapping keeps up.
+    """How well mapping keeps up with the frames.
 
     Attributes:
         offered_hz: Complete frames per second.
         mapped_hz: Keyframes mapped per second.
-        unmapped: Share of the frames that were dropped from the full queue, 0 to 1.
-        busy: Share of the time that mapping works, 0 to 1.
+        unmapped: Share of the frames that were dropped because the queue was full, 0 to 1.
+        busy: Share of the time in which mapping works, 0 to 1.
         waiting: Frames in the queue.
-        waiting_s: How long frames have been waiting with none finished, seconds.
+        waiting_s: Time since the last frame was finished while frames wait, seconds.
     """
 
     offered_hz: float
@@ -65,11 +65,11 @@ class Pace:
 
 
 def too_slow(pace: Pace, latencies: Mapping[str, Latency]) -> Problem | None:
-    """Mapping stands still, loses frames to the full queue, or is about to.
+    """Report that mapping stands still, drops frames from its full queue, or is about to.
 
     Args:
-        pace: How it keeps up.
-        latencies: How long each stage takes, by its name.
+        pace: How well mapping keeps up.
+        latencies: Times of each stage, by its name.
     """
     if pace.waiting and pace.waiting_s >= _STALLED_S:
         sentence = (
@@ -93,7 +93,7 @@ def too_slow(pace: Pace, latencies: Mapping[str, Latency]) -> Problem | None:
 
 
 def near_budget(states: Sequence[MemoryState]) -> list[Problem]:
-    """Memories that are at nine tenths of their budget or beyond."""
+    """Report the memories that use nine tenths of their budget or more."""
     return [
         Problem(
             "memory",

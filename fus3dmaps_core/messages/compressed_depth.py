@@ -39,12 +39,12 @@ class DepthFormat(NamedTuple):
 
 
 def is_compressed_depth(text: str) -> bool:
-    """Whether a message's ``format`` names the ``compressedDepth`` transport."""
+    """Return whether a message's ``format`` names the ``compressedDepth`` transport."""
     return _TRANSPORT in text
 
 
 def parse_depth_format(text: str) -> DepthFormat:
-    """What a message's ``format`` says, as in ``16UC1; compressedDepth rvl``, ``16UC1; png compressed`` or ``png``.
+    """Parse a message's ``format``, such as ``16UC1; compressedDepth rvl``, ``16UC1; png compressed`` or ``png``.
 
     Raises:
         FrameError: Reason ``unknown_encoding``: neither a PNG of 16 bits nor ``compressedDepth`` of 16UC1 or 32FC1.
@@ -64,7 +64,7 @@ def parse_depth_format(text: str) -> DepthFormat:
 
 
 def compressed_depth_size(data: bytes, text: str) -> tuple[int, int]:
-    """Width and height of a compressed depth image, from its header.
+    """Read width and height of a compressed depth image from its header.
 
     Args:
         data: The message's data.
@@ -72,7 +72,7 @@ def compressed_depth_size(data: bytes, text: str) -> tuple[int, int]:
 
     Raises:
         FrameError: Reasons ``unknown_encoding``, ``bad_compression`` (the header is cut, damaged or none) or ``bad_image``
-            (no pixels, or too many to be true).
+            (no pixels, or more than ``MAX_PIXELS``).
     """
     form = parse_depth_format(text)
     if form.code == "rvl":
@@ -82,7 +82,7 @@ def compressed_depth_size(data: bytes, text: str) -> tuple[int, int]:
 
 
 def check_compressed_depth(data: bytes, text: str) -> None:
-    """Check format, size and, of a PNG, kind of pixels and end marker, without decoding pixels.
+    """Check format and size, and for a PNG also pixel type and end marker, without decoding pixels.
 
     Raises:
         FrameError: As :func:`compressed_depth_size`; ``unknown_encoding`` also when an image is not grey of 16 bits.
@@ -97,7 +97,7 @@ def check_compressed_depth(data: bytes, text: str) -> None:
 
 
 def decode_compressed_depth(data: bytes, text: str, unit_m: float) -> NDArray[np.float32]:
-    """The readings of a compressed depth image, (h, w) float32 metres; no reading is 0 (16 bit) or NaN (float).
+    """Decode a compressed depth image into (h, w) float32 metres; no reading is 0 (16 bit) or NaN (float).
 
     Args:
         data: The message's data.
@@ -141,7 +141,7 @@ def _check_16_bit(header: ImageHeader) -> None:
 
 
 def _quantisation(data: bytes) -> tuple[float, float]:
-    """A and B of inverse depth; data holds them, for an image follows."""
+    """Read A and B of inverse depth from data that is known to be long enough."""
     numerator, offset = struct.unpack_from("<ff", data, 4)
     if not (np.isfinite(numerator) and np.isfinite(offset) and numerator > 0):
         raise FrameError(f"inverse depth cannot be quantised by A = {numerator}, B = {offset}", reason="bad_compression")

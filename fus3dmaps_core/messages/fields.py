@@ -1,7 +1,7 @@
-"""From ROS messages to arrays, without ROS: anything that has a message's fields will do.
+"""Conversion of ROS messages to arrays, without ROS: any object with the fields of the message is accepted.
 
-The functions take images, ``sensor_msgs/CameraInfo`` and poses as rclpy delivers them or as rosbags deserialises them. Every
-refusal is a FrameError whose message names the topic. Images are decoded in :mod:`fus3dmaps_core.messages.images`.
+The functions take ``sensor_msgs/CameraInfo`` and poses as rclpy delivers them or as rosbags deserialises them. A message
+that cannot be used raises a FrameError that names the topic. Images are decoded in :mod:`fus3dmaps_core.messages.images`.
 """
 
 from __future__ import annotations
@@ -15,35 +15,21 @@ from scipy.spatial.transform import Rotation
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.distortion import Distortion
-from fus3dmaps_core.messages.images import about, check_color, check_depth, decode_color, decode_depth, image_size
+from fus3dmaps_core.messages.images import about
 
-__all__ = [
-    "check_color",
-    "check_depth",
-    "decode_color",
-    "decode_depth",
-    "image_size",
-    "stamp_ns",
-    "to_distortion",
-    "to_intrinsics",
-    "to_pose",
-    "transform_from",
-    "transform_of",
-]
-
-_QUATERNION_TOLERANCE = 1e-2  # Publishers round; farther from unit length is not a rotation but a bug or an unset field.
+_QUATERNION_TOLERANCE = 1e-2  # Publishers round. A larger deviation is a bug or an unset field, not a rotation.
 
 
 def stamp_ns(message: Any) -> int:
-    """The stamp of a message's header, nanoseconds since the epoch of its clock."""
+    """Return the stamp of a message's header, nanoseconds since the epoch of its clock."""
     stamp = message.header.stamp
     return int(stamp.sec) * 1_000_000_000 + int(stamp.nanosec)
 
 
 def to_intrinsics(message: Any, topic: str) -> Intrinsics:
-    """The pinhole model of a ``CameraInfo``, for the image as published: region of interest and binning are applied.
+    """Return the pinhole model of a ``CameraInfo`` for the image as published, with region of interest and binning applied.
 
-    The raw camera matrix K is used; :func:`to_distortion` gives what the lens adds to it.
+    The raw camera matrix K is used; :func:`to_distortion` gives the lens distortion.
 
     Raises:
         FrameError: Reason ``bad_intrinsics``: a focal length or size is not positive, or a value not finite.
@@ -59,10 +45,11 @@ def to_intrinsics(message: Any, topic: str) -> Intrinsics:
 
 
 def to_distortion(message: Any, topic: str) -> Distortion | None:
-    """The lens distortion of a ``CameraInfo``, None where the image needs no rectification.
+    """Return the lens distortion of a ``CameraInfo``, or None if the image needs no rectification.
 
-    It goes with :func:`to_intrinsics`: coefficients are of rays, not of pixels, so neither region of interest nor binning
-    changes them. None means an unset model or coefficients that are all 0, as ROS reads it: also of ``equidistant``.
+    It belongs to the model of :func:`to_intrinsics`. Coefficients apply to rays, not to pixels, so region of interest and
+    binning do not change them. As in ROS, None stands for an unset model or coefficients that are all 0, even of
+    ``equidistant``.
 
     Raises:
         FrameError: Reason ``bad_intrinsics``: an unknown model, a wrong number of coefficients or a value not finite.
@@ -78,7 +65,7 @@ def to_distortion(message: Any, topic: str) -> Distortion | None:
 
 
 def to_pose(message: Any, topic: str) -> NDArray[np.float64]:
-    """The pose of a ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry`` in its header's frame, (4, 4) float64.
+    """Return the (4, 4) pose of a ``PoseStamped``, ``PoseWithCovarianceStamped`` or ``Odometry`` in its header's frame.
 
     Raises:
         FrameError: Reason ``bad_pose``: a value is not finite, or the quaternion's length is off 1 by more than 0.01.
@@ -90,7 +77,7 @@ def to_pose(message: Any, topic: str) -> NDArray[np.float64]:
 
 
 def transform_of(message: Any, topic: str) -> NDArray[np.float64]:
-    """The transform of a ``TransformStamped``, (4, 4) float64: the pose of its child frame in its header's frame.
+    """Return the (4, 4) transform of a ``TransformStamped``, the pose of its child frame in its header's frame.
 
     Raises:
         FrameError: As :func:`to_pose`.
@@ -100,7 +87,7 @@ def transform_of(message: Any, topic: str) -> NDArray[np.float64]:
 
 
 def transform_from(values: tuple[float, ...] | list[float]) -> NDArray[np.float64]:
-    """The (4, 4) transform of x, y, z (metres), qx, qy, qz, qw; the quaternion is normalised.
+    """Return the (4, 4) transform for x, y, z (metres), qx, qy, qz, qw. The quaternion is normalised.
 
     Raises:
         FrameError: As :func:`to_pose`.

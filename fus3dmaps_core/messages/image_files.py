@@ -1,7 +1,7 @@
-"""JPEG and PNG data in memory: what their headers say, whether they are whole, their pixels.
+"""JPEG and PNG data in memory: reading headers, checking that the data is complete, decoding pixels.
 
-Decoders fill what is missing with grey or noise and return it as if it were an image. A frame that lost its end on the way
-must not become a map, so completeness is checked here, before pixels are decoded.
+Image decoders fill missing pixels with grey or noise and report no error. A truncated frame must not get into the map, so
+completeness is checked here before pixels are decoded.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PNG_END = b"\x00\x00\x00\x00IEND\xaeB`\x82"
 
 
 class ImageHeader(NamedTuple):
-    """What the header of a JPEG or PNG says.
+    """The header of a JPEG or PNG.
 
     Attributes:
         kind: The container, by its first bytes.
@@ -45,7 +45,7 @@ class ImageHeader(NamedTuple):
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """The header of a JPEG or PNG, without decoding pixels.
+    """Read the header of a JPEG or PNG, without decoding pixels.
 
     Raises:
         FrameError: Reason ``bad_compression`` (neither JPEG nor PNG, or the header is cut or damaged) or ``bad_image`` (no
@@ -68,7 +68,7 @@ def check_size(width: int, height: int) -> None:
 
 
 def check_ends(data: bytes) -> ImageHeader:
-    """Check first bytes, header and end marker of a JPEG or PNG, which is cheap; bytes of 0 may follow the end.
+    """Check first bytes, header and end marker of a JPEG or PNG, which is cheap. Zero bytes may follow the end marker.
 
     Returns:
         The header.
@@ -84,7 +84,7 @@ def check_ends(data: bytes) -> ImageHeader:
 
 
 def decode_pixels(data: bytes, flags: int) -> NDArray[Any]:
-    """The pixels of a JPEG or PNG as OpenCV gives them for its ``IMREAD_`` flags, blue first.
+    """Decode a JPEG or PNG by OpenCV's ``IMREAD_`` flags; blue comes first.
 
     Raises:
         FrameError: As :func:`check_ends`, and reason ``bad_compression`` when a part of a PNG does not match its checksum or

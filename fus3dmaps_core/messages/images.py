@@ -1,7 +1,8 @@
-"""Pixels of image messages: raw, and compressed as image_transport does.
+"""Checking and decoding of image messages, raw or compressed by image_transport.
 
 The functions take ``sensor_msgs/Image`` and ``sensor_msgs/CompressedImage``, as rclpy delivers them or as rosbags
-deserialises them. Every refusal is a FrameError whose message names the topic.
+deserialises them. A message that cannot be used raises a FrameError
+that names the topic.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from fus3dmaps_core.messages.image_files import check_ends, decode_pixels, read_
 
 
 class _Encoding(NamedTuple):
-    """How a pixel is stored: scalar type, number of channels, and which of them are red, green and blue (or all three)."""
+    """How a pixel is stored: scalar type, number of channels, and which of them are red, green and blue."""
 
     dtype: np.dtype[Any]
     channels: int = 1
@@ -52,7 +53,7 @@ _COLOR_FILES = ("jpeg", "jpg", "png")  # cv_bridge writes jpg.
 
 @contextmanager
 def about(topic: str) -> Iterator[None]:
-    """Within it, every FrameError's message begins with the topic."""
+    """Put the topic in front of the message of every FrameError raised inside the ``with`` block."""
     try:
         yield
     except FrameError as error:
@@ -60,7 +61,7 @@ def about(topic: str) -> Iterator[None]:
 
 
 def image_size(message: Any, topic: str) -> tuple[int, int]:
-    """Width and height of an image, pixels, without decoding it.
+    """Read width and height of an image in pixels, without decoding it.
 
     Raises:
         FrameError: Reasons ``bad_image`` (no pixels), ``bad_compression`` (the header is cut, damaged or none) or
@@ -78,9 +79,9 @@ def image_size(message: Any, topic: str) -> tuple[int, int]:
 
 
 def check_color(message: Any, topic: str) -> None:
-    """Check a colour image without touching its pixels.
+    """Check a colour image without decoding its pixels.
 
-    Of a raw image: encoding, sizes and data length. Of a compressed one: format, first bytes, header and end marker.
+    For a raw image, check encoding, sizes and data length; for a compressed one, format, first bytes, header and end marker.
 
     Raises:
         FrameError: Reasons ``unknown_encoding``, ``bad_image`` (no pixels, rows too short), ``size_mismatch`` (the data
@@ -94,7 +95,7 @@ def check_color(message: Any, topic: str) -> None:
 
 
 def check_depth(message: Any, topic: str) -> None:
-    """As :func:`check_color`, for a depth image."""
+    """Check a depth image without decoding its pixels; raises the errors of :func:`check_color`."""
     with about(topic):
         if _is_compressed(message):
             check_compressed_depth(bytes(message.data), message.format)
@@ -103,10 +104,10 @@ def check_depth(message: Any, topic: str) -> None:
 
 
 def decode_color(message: Any, topic: str) -> NDArray[np.uint8]:
-    """The pixels of a colour or grey image as (H, W, 3) uint8, red first; a fresh array.
+    """Decode a colour or grey image into a new (H, W, 3) uint8 array, red first.
 
-    The colours of a compressed image are those of the JPEG or PNG, whatever else its format says; an orientation in it is
-    ignored, for the camera model knows none.
+    The colours of a compressed image are taken from the JPEG or PNG, whatever its format field says. An orientation tag is
+    ignored, because the camera model has none.
 
     Raises:
         FrameError: As :func:`check_color`, and reason ``bad_compression`` when pixels cannot be decoded.
@@ -122,7 +123,7 @@ def decode_color(message: Any, topic: str) -> NDArray[np.uint8]:
 
 
 def decode_depth(message: Any, topic: str, unit_m: float) -> NDArray[np.float32]:
-    """The readings of a depth image as (h, w) float32 metres; no reading stays 0 (16 bit) or 0, NaN or inf (float).
+    """Decode a depth image into (h, w) float32 metres; pixels without a reading are 0 (16 bit) or 0, NaN or inf (float).
 
     Args:
         message: Image of encoding 16UC1, mono16 or 32FC1, or CompressedImage: a 16-bit PNG, or ``compressedDepth``.
@@ -186,7 +187,7 @@ def _checked_encoding(message: Any, encodings: dict[str, _Encoding]) -> _Encodin
 
 
 def _pixels(message: Any, encoding: _Encoding) -> NDArray[Any]:
-    """View of the pixels, (H, W, channels), in the byte order of the message."""
+    """Return the pixels as (H, W, channels), in the byte order of the message."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     row_bytes = width * encoding.channels * encoding.dtype.itemsize
     rows = np.frombuffer(message.data, dtype=np.uint8).reshape(height, step)[:, :row_bytes]

@@ -1,9 +1,10 @@
 """Decoder of RVL, the lossless code for depth images of A. D. Wilson (Fast Lossless Depth Image Compression, 2017).
 
-The image is a row of pixels: a number of zeros, a number of non-zeros, and for each of these the difference to the non-zero
-before it (anywhere in the image), and again. Differences are folded to natural numbers (0, -1, 1, -2 ... to 0, 1, 2, 3 ...).
-All numbers are cut into groups of three bits, lowest first, each in a nibble whose highest bit says that more follow. Eight
-nibbles, first one highest, make a 32-bit word, which is stored as the machine that wrote it does: little-endian here.
+The image is one row of pixels, coded as runs. A run is a number of zeros, a number of non-zeros, and for each non-zero its
+difference to the last non-zero before it, anywhere in the image. Differences are folded to natural numbers (0, -1, 1, -2 ...
+become 0, 1, 2, 3 ...). Every number is cut into groups of three bits, lowest first; each group is stored in a nibble whose
+highest bit says that another follows. Eight nibbles, the first one highest, make a 32-bit word in the byte order of the
+machine that wrote it: little-endian here.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import FrameError
 
-_MAX_NIBBLES = 11  # Of a number of 32 bits.
+_MAX_NIBBLES = 11  # A number of 32 bits has this many.
 _LARGEST = 65535
 
 
 def decode_rvl(data: bytes, pixels: int) -> NDArray[np.uint16]:
-    """The pixels of an image.
+    """Decode the pixels of an image.
 
     Args:
         data: Words of the code; what follows the last pixel is ignored.
@@ -30,8 +31,8 @@ def decode_rvl(data: bytes, pixels: int) -> NDArray[np.uint16]:
         (pixels,) uint16.
 
     Raises:
-        FrameError: Reason ``bad_compression``: the code ends before the last pixel, or is none: a run passes the last pixel,
-            a difference leaves 1 to 65535.
+        FrameError: Reason ``bad_compression``: the code ends before the last pixel or is not valid: a run passes the last
+            pixel, or a value leaves the range 1 to 65535.
     """
     numbers = _numbers(data)
     zeros, others = _runs(numbers, pixels)
@@ -49,7 +50,7 @@ def decode_rvl(data: bytes, pixels: int) -> NDArray[np.uint16]:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64]:
-    """All complete numbers of the code, in order; one of more than 32 bits ends the row."""
+    """Read all complete numbers of the code in order; stop at one of more than 32 bits."""
     words = np.frombuffer(data, "<u4", count=len(data) // 4)
     octets = words.astype(">u4").view(np.uint8)
     nibbles = np.stack([octets >> 4, octets & 0xF], axis=1).ravel()
@@ -68,7 +69,7 @@ def _numbers(data: bytes) -> NDArray[np.int64]:
 
 
 def _runs(numbers: NDArray[np.int64], pixels: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """How many zeros and how many others each run has."""
+    """Count the zeros and the non-zeros of each run."""
     row = numbers.tolist()
     runs = []
     pixel = at = 0

@@ -1,4 +1,4 @@
-"""Reading of rosbag2 recordings: raw CDR messages in time order, also from files that break off."""
+"""Reading of rosbag2 recordings: raw CDR messages in time order, also from truncated files."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from fus3dmaps_core.errors import RecordingError
+from fus3dmaps_core.recordings.recorded_files import RawMessage, RecordedFiles, TopicSummary
 from fus3dmaps_core.recordings.salvage import SalvagedMcap
-from fus3dmaps_core.recordings.storage import RawMessage, Storage, TopicSummary
 
-_STORAGE_SUFFIXES = (".mcap", ".db3")
+_SUFFIXES = (".mcap", ".db3")
 
 
 class RecordingReader:
     """A rosbag2 directory (``metadata.yaml`` and its .mcap or .db3 files) or a bare .mcap or .db3 file.
 
-    A directory whose recorder was killed before it wrote ``metadata.yaml`` is read file by file. Of a damaged .mcap file,
-    what is readable is delivered. Use it as a context manager.
+    A directory without ``metadata.yaml``, whose recorder was killed, is read file by file. The readable part of a damaged
+    .mcap file is delivered. Use it as a context manager.
 
     Attributes:
-        path: What was opened.
-        damage: What is wrong with the files, or None. Damage inside an indexed file shows only while it is read.
+        path: The file or directory that was opened.
+        damage: What is wrong with the files, or None. Damage inside an indexed file is only found while it is read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -42,35 +42,35 @@ class RecordingReader:
         self.damage: str | None = None
         if not path.exists():
             raise RecordingError(f"recording '{path}' does not exist")
-        self._storages = self._open()
+        self._parts = self._open()
         if self.message_count == 0:
             self.close()
             raise RecordingError(f"recording '{path}' holds no messages" + (f": {self.damage}" if self.damage else ""))
 
     @property
     def topics(self) -> dict[str, TopicSummary]:
-        """What the recording holds, by topic."""
+        """Summaries of the recording's topics, by name."""
         merged: dict[str, TopicSummary] = {}
-        for storage in self._storages:
-            for topic, summary in storage.topics.items():
+        for part in self._parts:
+            for topic, summary in part.topics.items():
                 known = merged.get(topic)
                 merged[topic] = summary if known is None else replace(known, count=known.count + summary.count)
         return dict(sorted(merged.items()))
 
     @property
     def message_count(self) -> int:
-        """Number of messages on all topics; of a damaged file, those that can be read."""
-        return sum(summary.count for storage in self._storages for summary in storage.topics.values())
+        """Number of readable messages on all topics."""
+        return sum(summary.count for part in self._parts for summary in part.topics.values())
 
     @property
     def start_ns(self) -> int:
         """Earliest time of recording, nanoseconds."""
-        return min(storage.start_ns for storage in self._storages)
+        return min(part.start_ns for part in self._parts)
 
     @property
     def end_ns(self) -> int:
         """Latest time of recording, nanoseconds."""
-        return max(storage.end_ns for storage in self._storages)
+        return max(part.end_ns for part in self._parts)
 
     @property
     def duration_s(self) -> float:
@@ -78,18 +78,18 @@ class RecordingReader:
         return (self.end_ns - self.start_ns) / 1e9
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """The messages in order of time (of a damaged file: in its own order), of the given topics or of all.
+        """Yield the messages of the given topics, or of all, in order of time; those of a damaged file in its own order.
 
         Raises:
             RecordingError: After everything readable was delivered, if the recording is damaged.
         """
         count = 0
-        for storage in self._storages:
-            iterator = storage.messages(topics)
+        for part in self._parts:
+            iterator = part.messages(topics)
             while True:
                 try:
                     message = next(iterator, None)
-                # Whatever a parser stumbles over in a damaged file, the answer is the same and names the file.
+                # Any failure of a parser in a damaged file is answered the same way, by an error that names the file.
                 except Exception as error:
                     self.damage = self.damage or _reason(error)
                     break
@@ -117,12 +117,12 @@ class RecordingReader:
 
     def close(self) -> None:
         """Release the files."""
-        for storage in self._storages:
-            storage.close()
-        self._storages = []
+        for part in self._parts:
+            part.close()
+        self._parts = []
 
     def __enter__(self) -> RecordingReader:
-        """Nothing to do: the recording is open already."""
+        """Return the reader: the recording is open already."""
         return self
 
     def __exit__(
@@ -131,36 +131,36 @@ class RecordingReader:
         """Release the files."""
         self.close()
 
-    def _open(self) -> list[Storage]:
+    def _open(self) -> list[RecordedFiles]:
         if self.path.is_file():
-            if self.path.suffix not in _STORAGE_SUFFIXES:
+            if self.path.suffix not in _SUFFIXES:
                 raise RecordingError(f"recording '{self.path}' is neither a directory nor a .mcap or .db3 file")
             return [self._open_file(self.path)]
         if (self.path / "metadata.yaml").exists():
             try:
-                return [_IndexedStorage(self.path)]
+                return [_IndexedFiles(self.path)]
             except Exception as error:
                 self.damage = _reason(error)
-        files = sorted((p for p in self.path.iterdir() if p.suffix in _STORAGE_SUFFIXES), key=_natural_order)
+        files = sorted((p for p in self.path.iterdir() if p.suffix in _SUFFIXES), key=_natural_order)
         if not files:
             raise RecordingError(
                 f"recording '{self.path}' cannot be read: {self.damage}"
                 if self.damage
                 else f"directory '{self.path}' is not a recording: it holds no metadata.yaml, .mcap or .db3 file"
             )
-        storages: list[Storage] = []
+        parts: list[RecordedFiles] = []
         for file in files:
             try:
-                storages.append(self._open_file(file))
+                parts.append(self._open_file(file))
             except RecordingError as error:
                 self.damage = self.damage or str(error)
-        if not storages:
+        if not parts:
             raise RecordingError(f"recording '{self.path}' cannot be read: {self.damage}")
-        return storages
+        return parts
 
-    def _open_file(self, path: Path) -> Storage:
+    def _open_file(self, path: Path) -> RecordedFiles:
         try:
-            return _IndexedStorage(path)
+            return _IndexedFiles(path)
         except Exception as error:
             reason = _reason(error)
             if path.suffix == ".mcap":
@@ -171,8 +171,8 @@ class RecordingReader:
             raise RecordingError(f"recording '{path}' cannot be read: {reason}") from error
 
 
-class _IndexedStorage:
-    """What rosbags can open: a directory with metadata, or a complete file."""
+class _IndexedFiles:
+    """A directory with metadata or a complete file, which rosbags can open."""
 
     def __init__(self, path: Path) -> None:
         self._reader = Reader(path)
@@ -205,5 +205,5 @@ def _reason(error: Exception) -> str:
 
 
 def _natural_order(path: Path) -> list[tuple[int, str]]:
-    """Sort key by which ``bag_10`` follows ``bag_9``."""
+    """Return a sort key by which ``bag_10`` follows ``bag_9``."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

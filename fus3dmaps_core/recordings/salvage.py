@@ -1,4 +1,4 @@
-"""Reading of an MCAP file that breaks off: a recorder was killed, a disk ran full, a copy was cut short."""
+"""Reading of a truncated or damaged MCAP file, left by a killed recorder, a full disk or an incomplete copy."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 
-from fus3dmaps_core.recordings.storage import RawMessage, TopicSummary
+from fus3dmaps_core.recordings.recorded_files import RawMessage, TopicSummary
 
 
 class SalvagedMcap:
-    """What can be read of a damaged MCAP file, front to back, in the order of the file.
+    """The readable part of a damaged MCAP file, from its start to the damage, in the order of the file.
 
     Attributes:
-        topics: What the readable part holds, by topic.
+        topics: Summaries of the topics of the readable part, by name.
         start_ns: Earliest log time, nanoseconds.
         end_ns: Latest log time, nanoseconds.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the file once to learn how far it goes; a file without a single message has no topics."""
+        """Read the file once to find how far it can be read; a file without a readable message has no topics."""
         self._path = path
         self.topics: dict[str, TopicSummary] = {}
         self.start_ns = self.end_ns = 0
@@ -33,7 +33,7 @@ class SalvagedMcap:
             self.topics[message.topic] = replace(known, count=known.count + 1)
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        """The messages up to the damage, of the given topics or of all."""
+        """Yield the messages up to the damage, of the given topics or of all."""
         schemas: dict[int, str] = {}
         channels: dict[int, tuple[str, str]] = {}
         with self._path.open("rb") as stream:
@@ -41,7 +41,7 @@ class SalvagedMcap:
             while True:
                 try:
                     record = next(records, None)
-                # A damaged file can trip the parser anywhere, with any exception; the caller already knows of the damage.
+                # A damaged file can make the parser fail anywhere, with any exception. The caller knows of the damage.
                 except Exception:
                     return
                 if record is None:
@@ -56,4 +56,4 @@ class SalvagedMcap:
                         yield RawMessage(topic, msgtype, record.log_time, record.data)
 
     def close(self) -> None:
-        """Nothing stays open between two readings."""
+        """Do nothing: the file is open only while it is read."""

@@ -51,12 +51,12 @@ _OFFERED_QOS = """\
 
 
 class RecordingWriter:
-    """Writes camera model, pose, depth and colour image of each frame, in this order, under the frame's stamp.
+    """Writes camera model, pose, depth and colour image of each frame, in this order, with the frame's stamp.
 
-    The file is what ``ros2 bag record --storage mcap`` makes: profile ``ros2``, CDR messages, full message definitions.
-    Depth is 16UC1 millimetres (REP-118; 0 where there is no reading or beyond 65.5 m), colour rgb8, poses are PoseStamped on
-    the configured pose topic, such that a reader with the same configuration gets the camera's pose back. The same frames
-    give the same bytes. The file appears under its name when the ``with`` block ends without an exception, not before.
+    The file has the form of ``ros2 bag record --storage mcap``: profile ``ros2``, CDR messages, full message definitions.
+    Depth is 16UC1 millimetres (REP-118; 0 where there is no reading or beyond 65.5 m), colour rgb8. Poses are PoseStamped
+    on the configured pose topic; a reader with the same configuration gets the camera's pose back. Equal frames give equal
+    bytes. The file gets its name only when the ``with`` block ends without an exception.
 
     Attributes:
         frame_count: Frames written so far.
@@ -76,13 +76,12 @@ class RecordingWriter:
             path: File to write, must end in ``.mcap``; its directory is made if missing.
             config: Topics, the map frame and the mounting of the camera.
             overwrite: Whether an existing file is replaced.
-            compression: Of the chunks. lz4 writes about half again as fast as zstd, at 1.3 times
-                the size.
+            compression: Of the chunks. lz4 writes about 1.5 times as fast as zstd, at 1.3 times the size.
 
         Raises:
             RecordingError: The name is unsuitable, the file exists or cannot be written.
-            ConfigError: ``input.T_body_camera`` is not a pose, or the configuration asks for inputs of another kind than
-                what is written; the message names the parameter.
+            ConfigError: ``input.T_body_camera`` is not a pose, or the configuration names a kind of input that cannot
+                be written; the message names the parameter.
         """
         self._config = config or InputConfig()
         for name, value in _WRITTEN.items():
@@ -135,7 +134,7 @@ class RecordingWriter:
         self.frame_count += 1
 
     def __enter__(self) -> RecordingWriter:
-        """Nothing to do: the file is open already."""
+        """Return the writer: the file is open already."""
         return self
 
     def __exit__(
@@ -214,7 +213,7 @@ class RecordingWriter:
         return self._make("sensor_msgs/msg/Image", header, height, width, encoding, 0, data.size // height, data)
 
     def _discard(self) -> None:
-        # On a full disk closing fails again, on data that nobody wants any more.
+        # On a full disk closing fails again; the data is not wanted any more.
         with suppress(OSError):
             self._file.close()
         self._partial.unlink(missing_ok=True)
@@ -225,5 +224,5 @@ class RecordingWriter:
 
 def _millimetres(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     depth_mm = np.rint(depth_m.astype(np.float64) * 1000.0)
-    usable = (depth_mm > 0) & (depth_mm <= _MAX_DEPTH_MM)  # False for NaN, too.
+    usable = (depth_mm > 0) & (depth_mm <= _MAX_DEPTH_MM)  # NaN gives False.
     return np.where(usable, depth_mm, 0.0).astype(np.uint16)

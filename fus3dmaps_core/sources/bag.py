@@ -10,9 +10,9 @@ from typing import Any
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
-from fus3dmaps_core.recordings.storage import TopicSummary
+from fus3dmaps_core.recordings.recorded_files import TopicSummary
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
-from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_core.sources.streams import Stream, uses_tf
 from fus3dmaps_core.sources.transforms import TransformTree
 
 _TF_TYPE = "tf2_msgs/msg/TFMessage"
@@ -20,56 +20,47 @@ _TF_TOPICS = ("/tf", "/tf_static")
 
 
 class BagSource:
-    """Reads the topics that the configuration names from a recording and pairs them as the live node does.
+    """Reads the configured topics from a recording and pairs their messages as the live node does.
 
-    Topic names match with or without their leading slash. TF is what the recording holds on ``/tf`` and ``/tf_static``. Use
-    it as a context manager; each iteration starts anew.
+    Topic names match with or without their leading slash. TF is read from ``/tf`` and ``/tf_static``. Use it as a context
+    manager; each iteration starts from the beginning.
 
     Attributes:
-        pairer: Counts what the current (or last) iteration received and dropped.
-        messages_read: Messages of the configured topics taken so far in this iteration.
-        messages_total: Messages of the configured topics in the recording.
+        pairer: The pairer of the current (or last) iteration; it counts drops.
     """
 
     def __init__(self, path: Path, config: InputConfig) -> None:
         """Open a recording.
 
         Raises:
-            RecordingError: It cannot be read, or lacks a topic or holds it with another message type; the message names
-                the topic and its parameter and lists what the recording has.
+            RecordingError: It cannot be read, or a topic is missing or has another message type. The message names the
+                topic and its parameter and lists the topics of the recording.
             ConfigError: As :class:`FramePairer`.
         """
         self._config = config
         self.pairer, _ = self._new_pairer()
-        self.messages_read = 0
         self._reader = RecordingReader(path)
         try:
-            inputs = [(stream.parameter, self._require(stream)) for stream in self.pairer.streams()]
-            transforms = self._require_tf() if uses_tf(config) else []
+            found = [(stream.role, self._require(stream)) for stream in self.pairer.streams()]
+            if uses_tf(config):
+                self._require_tf()
         except RecordingError:
             self._reader.close()
             raise
-        self._frames = sum(found.count for parameter, found in inputs if parameter == "input.rgb_topic")
-        self.messages_total = sum(found.count for found in [*(found for _, found in inputs), *transforms])
+        self._frames = sum(summary.count for role, summary in found if role == "rgb")
 
     def __len__(self) -> int:
-        """Colour images in the recording, each of which becomes at most one frame."""
+        """Count the colour images in the recording; each becomes at most one frame."""
         return self._frames
 
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last message of the recording, seconds."""
-        return self._reader.duration_s
-
     def __iter__(self) -> Iterator[PairedMessages]:
-        """The pairs in the order of the recording; messages that cannot be used are counted by :attr:`pairer`.
+        """Yield the pairs in the order of the recording; :attr:`pairer` counts messages that cannot be used.
 
         Raises:
             RecordingError: After everything readable was delivered, if the recording is damaged.
         """
         self.pairer, add = self._new_pairer()
         pairer = self.pairer
-        self.messages_read = 0
         damage: RecordingError | None = None
         messages = self._reader.messages(add)
         while True:
@@ -80,7 +71,6 @@ class BagSource:
                 break
             if raw is None:
                 break
-            self.messages_read += 1
             try:
                 message = self._reader.deserialize(raw)
             except RecordingError as error:
@@ -97,7 +87,7 @@ class BagSource:
         self._reader.close()
 
     def __enter__(self) -> BagSource:
-        """Nothing to do: the recording is open already."""
+        """Return the source: the recording is open already."""
         return self
 
     def __exit__(
@@ -107,7 +97,7 @@ class BagSource:
         self.close()
 
     def _new_pairer(self) -> tuple[FramePairer, dict[str, Callable[[Any], None]]]:
-        """A pairer, and what takes the messages of each topic of the recording for it."""
+        """Make a pairer, and a function for each topic that hands it a message."""
         tree = TransformTree(self._config.max_pose_gap_s) if uses_tf(self._config) else None
         pairer = FramePairer(self._config, tree)
         add = {_absolute(stream.topic): stream.add for stream in pairer.streams()}
@@ -115,7 +105,7 @@ class BagSource:
             add |= {topic: _transform_adder(tree, pairer, topic) for topic in _TF_TOPICS}
         return pairer, add
 
-    def _require(self, stream: InputStream) -> TopicSummary:
+    def _require(self, stream: Stream) -> TopicSummary:
         topic, msgtype = _absolute(stream.topic), stream.msgtype
         found = self._reader.topics.get(topic)
         if found is not None and found.msgtype == msgtype and found.count > 0:
@@ -128,13 +118,11 @@ class BagSource:
             problem = f"holds {found.msgtype} on topic '{topic}', not {msgtype}"
         raise self._refusal(f"{problem} (parameter '{stream.parameter}')")
 
-    def _require_tf(self) -> list[TopicSummary]:
-        topics = self._reader.topics
-        found = [topics[name] for name in _TF_TOPICS if name in topics and topics[name].msgtype == _TF_TYPE]
-        if not any(summary.count for summary in found):
+    def _require_tf(self) -> None:
+        found = [self._reader.topics.get(name) for name in _TF_TOPICS]
+        if not any(summary is not None and summary.msgtype == _TF_TYPE and summary.count for summary in found):
             source = "pose_source" if self._config.pose_source == "tf" else "extrinsic_source"
             raise self._refusal(f"holds no transforms on '/tf' or '/tf_static' (parameter 'input.{source}')")
-        return found
 
     def _refusal(self, problem: str) -> RecordingError:
         listing = ", ".join(f"{t.topic} ({t.msgtype}, {t.count} messages)" for t in self._reader.topics.values())

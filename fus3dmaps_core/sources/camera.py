@@ -1,4 +1,4 @@
-"""One camera: its colour images meet depth, pose and camera model by stamp."""
+"""Pairing for one camera: each colour image with depth, pose and camera model by stamp."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any, Literal
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
+from fus3dmaps_core.messages.images import check_color, check_depth, image_size
 from fus3dmaps_core.sources.paired import CameraModel, PairedMessages, UnregisteredDepth, check_size
 from fus3dmaps_core.sources.poses import FOREVER_NS, Moment, Mounting, PoseProvider
-from fus3dmaps_core.sources.streams import CameraTopics, InputStream, image_type
+from fus3dmaps_core.sources.streams import CameraTopics, Stream, image_type
 from fus3dmaps_core.sources.timeline import Tally, Timeline, seconds
 
 _ASPECT_TOLERANCE = 0.01
@@ -29,7 +30,7 @@ class _Stamped:
 
 
 class _Models:
-    """What ``camera_info`` said over time, for the images whose time it was."""
+    """The camera models of a ``camera_info`` topic over time."""
 
     def __init__(self, config: InputConfig, topic: str, tally: Tally) -> None:
         self.topic = topic
@@ -38,10 +39,9 @@ class _Models:
         self._models: deque[tuple[int, CameraModel]] = deque()
 
     def add(self, message: Any) -> None:
-        self._tally.received[self.topic] += 1
         try:
-            distortion = messages.to_distortion(message, self.topic) if self._rectify else None
-            model = CameraModel(messages.to_intrinsics(message, self.topic), distortion)
+            distortion = fields.to_distortion(message, self.topic) if self._rectify else None
+            model = CameraModel(fields.to_intrinsics(message, self.topic), distortion)
         except FrameError as error:
             self._tally.drop(error)
             return
@@ -52,13 +52,13 @@ class _Models:
             old, new = known.intrinsics, model.intrinsics
             changes = f"from {old} to {new}" if old != new else f"in its lens's distortion, now {distortion}"
             self._tally.drop(FrameError(f"{self.topic}: camera model changed {changes}", reason="intrinsics_changed"))
-        stamp_ns = messages.stamp_ns(message)
+        stamp_ns = fields.stamp_ns(message)
         while self._models and self._models[-1][0] >= stamp_ns:
             self._models.pop()
         self._models.append((stamp_ns, model))
 
     def at(self, stamp_ns: int) -> CameraModel | None:
-        """The latest that is not from after the stamp, else the first."""
+        """Return the latest model up to the stamp, or the first one if all are later."""
         earlier = [model for start_ns, model in self._models if start_ns <= stamp_ns]
         if earlier:
             return earlier[-1]
@@ -69,7 +69,7 @@ class _Models:
             self._models.popleft()
 
     def start_anew(self) -> None:
-        """The camera is the same when its clock changes."""
+        """Keep only the latest model, for all of the new time: a new clock does not change the camera."""
         if self._models:
             self._models = deque([(0, self._models[-1][1])])
 
@@ -91,12 +91,12 @@ class CameraPairer:
 
         Args:
             config: Tolerances and transports.
-            topics: Of this camera.
-            poses: Of the body; shared with the other cameras.
-            mounting: Of the camera on the body.
-            camera_frame: Its optical frame in TF; empty: what the images say.
+            topics: Topics of this camera.
+            poses: Poses of the body; shared with the other cameras.
+            mounting: Mounting of the camera on the body.
+            camera_frame: Its optical frame in TF; if empty, the frame named by the images.
             timeline: Stamps of all inputs.
-            tally: Counts of all inputs.
+            tally: Drops of all inputs.
         """
         self._config = config
         self._topics = topics
@@ -114,36 +114,31 @@ class CameraPairer:
         self._depth_models = None if topics.depth_camera_info is None else _Models(config, topics.depth_camera_info, tally)
 
     @property
-    def waiting(self) -> int:
-        """Images that wait for their partners."""
-        return len(self._rgb) + len(self._depth)
-
-    @property
     def oldest_ns(self) -> int | None:
-        """Stamp of the oldest colour image that waits."""
+        """Stamp of the oldest waiting colour image, nanoseconds."""
         return self._rgb[0].stamp_ns if self._rgb else None
 
-    def streams(self) -> Iterator[InputStream]:
-        """The topics of this camera."""
+    def streams(self) -> Iterator[Stream]:
+        """Yield the topics of this camera."""
         config, topics = self._config, self._topics
         info_type, info_qos = "sensor_msgs/msg/CameraInfo", config.camera_info_qos
         rgb_type, depth_type = image_type(config.rgb_transport), image_type(config.depth_transport)
-        yield InputStream(topics.rgb, rgb_type, "input.rgb_topic", config.rgb_qos, self.add_rgb)
-        yield InputStream(topics.depth, depth_type, "input.depth_topic", config.depth_qos, self.add_depth)
-        yield InputStream(topics.camera_info, info_type, "input.camera_info_topic", info_qos, self.add_camera_info)
-        if self._depth_models is not None:
-            name = self._depth_models.topic
-            yield InputStream(name, info_type, "input.depth_camera_info_topic", info_qos, self.add_depth_camera_info)
+        yield Stream(topics.rgb, "rgb", rgb_type, "input.rgb_topic", config.rgb_qos, self.add_rgb)
+        yield Stream(topics.depth, "depth", depth_type, "input.depth_topic", config.depth_qos, self.add_depth)
+        parameter = "input.camera_info_topic"
+        yield Stream(topics.camera_info, "camera_info", info_type, parameter, info_qos, self.add_camera_info)
+        if topics.depth_camera_info is not None:
+            parameter, add = "input.depth_camera_info_topic", self.add_depth_camera_info
+            yield Stream(topics.depth_camera_info, "camera_info", info_type, parameter, info_qos, add)
 
     def add_rgb(self, message: Any) -> None:
         """Take a colour image (``sensor_msgs/Image`` or ``CompressedImage``)."""
         topic = self._topics.rgb
-        self._tally.received[topic] += 1
         try:
-            messages.check_color(message, topic)
-            model = self._models.at(messages.stamp_ns(message))
+            check_color(message, topic)
+            model = self._models.at(fields.stamp_ns(message))
             if model is not None:
-                check_size(messages.image_size(message, topic), model.intrinsics, topic, self._topics.camera_info)
+                check_size(image_size(message, topic), model.intrinsics, topic, self._topics.camera_info)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
             self._tally.drop(error)
@@ -154,9 +149,8 @@ class CameraPairer:
     def add_depth(self, message: Any) -> None:
         """Take a depth image (``sensor_msgs/Image`` or ``CompressedImage``)."""
         topic = self._topics.depth
-        self._tally.received[topic] += 1
         try:
-            messages.check_depth(message, topic)
+            check_depth(message, topic)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
             self._tally.drop(error)
@@ -174,7 +168,7 @@ class CameraPairer:
             self._depth_models.add(message)
 
     def settle(self, final: bool) -> list[PairedMessages]:
-        """Pair or drop the oldest colour images until one has to wait; with ``final`` none waits."""
+        """Pair or drop colour images, oldest first, until one has to wait. With ``final`` none waits."""
         ready = []
         newest_ns = self._timeline.newest_ns
         while self._rgb:
@@ -191,12 +185,12 @@ class CameraPairer:
         return ready
 
     def forget_needless(self) -> int:
-        """Forget what no colour image can need any more.
+        """Remove messages that no colour image can need any more.
 
         Returns:
-            The earliest stamp, nanoseconds, at which one may still need something.
+            The earliest stamp, nanoseconds, whose messages may still be needed.
         """
-        # What is older than this can meet no colour image any more: colour stamps only rise.
+        # Older messages can match no colour image any more, because colour stamps only rise.
         oldest_ns = self._timeline.newest_ns - self._max_wait_ns
         if self._rgb:
             oldest_ns = self._rgb[0].stamp_ns
@@ -210,7 +204,7 @@ class CameraPairer:
         return oldest_ns
 
     def start_anew(self) -> None:
-        """Forget what waits; the camera model stays."""
+        """Remove waiting images; the camera model stays."""
         self._rgb.clear()
         self._depth.clear()
         self._models.start_anew()
@@ -224,7 +218,7 @@ class CameraPairer:
             self._tally.drop(FrameError(f"{topic}: frame_id changed from '{known}' to '{frame}'", reason="frame_id_changed"))
 
     def _pair(self, rgb: _Stamped, waited_ns: int) -> PairedMessages | None:
-        """The complete pair, or None while something may still come; FrameError once something cannot."""
+        """Return the complete pair, or None while a part may still come; raise FrameError once a part cannot come."""
         final = waited_ns > self._max_wait_ns
         moment = Moment(self._topics.rgb, self._camera_frame or rgb.frame, rgb.stamp_ns, waited_ns)
         depth = self._depth_for(rgb, final)
@@ -235,11 +229,11 @@ class CameraPairer:
         model = self._model_for(rgb, self._models, final, "rgb")
         if depth is None or model is None or T_body_camera is None:
             return None
-        size = messages.image_size(rgb.message, self._topics.rgb)
+        size = image_size(rgb.message, self._topics.rgb)
         check_size(size, model.intrinsics, self._topics.rgb, self._topics.camera_info)
         unregistered = None
         if self._depth_models is None:
-            self._check_same_view(size, messages.image_size(depth.message, self._topics.depth))
+            self._check_same_view(size, image_size(depth.message, self._topics.depth))
         else:
             unregistered = self._unregistered(depth, self._depth_models, moment, final)
             if unregistered is None:
@@ -257,7 +251,7 @@ class CameraPairer:
 
     def _depth_for(self, rgb: _Stamped, final: bool) -> _Stamped | None:
         last_ns = self._timeline.last_ns.get(self._topics.depth)
-        # The nearest is known once depth has come as far as the colour image.
+        # The nearest depth image is known once depth has reached the stamp of the colour image.
         if not final and (last_ns is None or last_ns < rgb.stamp_ns):
             return None
         nearest = min(self._depth, key=lambda depth: abs(depth.stamp_ns - rgb.stamp_ns), default=None)
@@ -288,11 +282,11 @@ class CameraPairer:
         if model is None or T_rgb_depth is None:
             return None
         topic = self._topics.depth
-        check_size(messages.image_size(depth.message, topic), model.intrinsics, topic, models.topic)
+        check_size(image_size(depth.message, topic), model.intrinsics, topic, models.topic)
         return UnregisteredDepth(model, T_rgb_depth)
 
     def _check_same_view(self, rgb_size: tuple[int, int], depth_size: tuple[int, int]) -> None:
-        """Registered depth may be of another resolution, not of another shape."""
+        """Raise FrameError if registered depth has another aspect ratio than colour; its resolution may differ."""
         (rgb_width, rgb_height), (width, height) = rgb_size, depth_size
         if abs(width * rgb_height / (height * rgb_width) - 1.0) > _ASPECT_TOLERANCE:
             raise FrameError(

@@ -1,4 +1,4 @@
-"""A colour and a depth image that belong together, and what it takes to make a posed frame of them."""
+"""A colour and a depth image that belong together, and their conversion to a posed frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.registration import register_depth
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.images import decode_color, decode_depth
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class CameraModel:
 
     Attributes:
         intrinsics: Pinhole model of the rectified image.
-        distortion: Of its lens; None where there is none to undo.
+        distortion: Distortion of its lens, None if there is none to undo.
     """
 
     intrinsics: Intrinsics
@@ -30,12 +30,12 @@ class CameraModel:
     _rectifiers: dict[tuple[int, int], Rectifier] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def rectified_color(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A colour image without the lens's distortion, (H, W, 3)."""
+        """Remove the lens distortion from an (H, W, 3) colour image."""
         rectifier = self._rectifier(*rgb.shape[:2])
         return rgb if rectifier is None else rectifier.color(rgb)
 
     def rectified_depth(self, depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """A depth image of the same view in any resolution without the lens's distortion, (h, w) metres."""
+        """Remove the lens distortion from an (h, w) depth image in metres, of the same view at any resolution."""
         rectifier = self._rectifier(*depth_m.shape)
         return depth_m if rectifier is None else rectifier.depth(depth_m)
 
@@ -43,14 +43,14 @@ class CameraModel:
         if self.distortion is None:
             return None
         if (width, height) not in self._rectifiers:
-            # Coefficients are those of normalised coordinates, so that they hold at any resolution.
+            # Coefficients apply to normalised coordinates, so they hold at any resolution.
             self._rectifiers[width, height] = Rectifier(self.intrinsics.resized(width, height), self.distortion)
         return self._rectifiers[width, height]
 
 
 @dataclass(frozen=True)
 class UnregisteredDepth:
-    """Of the camera that took a depth image, where that is not the colour camera.
+    """The camera of a depth image that was not taken by the colour camera.
 
     Attributes:
         model: The camera.
@@ -63,7 +63,7 @@ class UnregisteredDepth:
 
 @dataclass(frozen=True)
 class PairedMessages:
-    """A colour and a depth image with the pose and the camera model that belong to them, not yet decoded.
+    """A colour and a depth image, not yet decoded, with their pose and camera model.
 
     Attributes:
         stamp_ns: Stamp of the colour image, nanoseconds.
@@ -73,7 +73,7 @@ class PairedMessages:
         depth: The depth image message.
         rgb_topic: Topic of the colour image, for error messages.
         depth_topic: Topic of the depth image, for error messages.
-        unregistered: Camera of the depth image, None where the image is registered to colour.
+        unregistered: Camera of the depth image, None if the image is registered to colour.
     """
 
     stamp_ns: int
@@ -91,9 +91,9 @@ class PairedMessages:
         return self.model.intrinsics
 
     def decode(self, image: ImageConfig) -> PosedFrame:
-        """The frame with its pixels, rectified, depth registered to colour.
+        """Decode both images, rectify them and register depth to colour.
 
-        Colour is at the resolution of its message; so is depth, unless it had to be registered.
+        Both images keep the resolution of their message; depth that has to be registered takes that of colour.
 
         Args:
             image: ``depth_unit_m`` scales 16-bit depth.
@@ -101,8 +101,8 @@ class PairedMessages:
         Raises:
             FrameError: The images or the pose are not usable.
         """
-        rgb = messages.decode_color(self.rgb, self.rgb_topic)
-        depth_m = messages.decode_depth(self.depth, self.depth_topic, image.depth_unit_m)
+        rgb = decode_color(self.rgb, self.rgb_topic)
+        depth_m = decode_depth(self.depth, self.depth_topic, image.depth_unit_m)
         check_size((rgb.shape[1], rgb.shape[0]), self.intrinsics, self.rgb_topic, "its camera_info")
         if self.unregistered is None:
             depth_m = self.model.rectified_depth(depth_m)

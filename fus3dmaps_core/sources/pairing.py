@@ -1,6 +1,6 @@
-"""From single messages to posed frames: colour meets depth, pose and camera model by stamp, for one camera or several.
+"""Pairing of single messages by stamp: colour with depth, pose and camera model, for one camera or several.
 
-The same class serves the live node and recordings. It looks at headers only; pixels are decoded when a frame is wanted.
+The same class serves the live node and recordings. It only reads headers; pixels are decoded when a frame is wanted.
 """
 
 from __future__ import annotations
@@ -10,11 +10,11 @@ from typing import Any
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.fields import to_pose
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.poses import BufferedPoses, Mounting, PoseProvider, TransformPoses
-from fus3dmaps_core.sources.streams import InputStream, camera_topics, pose_parameter, pose_topic, pose_type, uses_tf
+from fus3dmaps_core.sources.streams import Stream, camera_topics, pose_parameter, pose_topic, pose_type, uses_tf
 from fus3dmaps_core.sources.timeline import Tally, Timeline
 from fus3dmaps_core.sources.transforms import TransformBuffer
 
@@ -24,11 +24,11 @@ __all__ = ["FramePairer", "PairedMessages"]
 class FramePairer:
     """Pairs each colour image with the nearest depth image and the pose at its stamp.
 
-    Feed it through :meth:`streams` or the ``add_`` methods and call :meth:`poll` after each message. Whatever cannot be used
-    is dropped and counted, never raised. Time is that of the stamps: an image is given up once any input has moved
-    ``max_wait_s`` (for a transform: ``tf_timeout_s``) past it, so memory stays bounded by what arrives in that span. A stamp
-    that goes back more than three seconds (a looped recording, a restarted simulation) ends what was waiting and pairing
-    goes on from the new time. A camera model holds from its stamp until one that differs. Several cameras share the poses
+    Hand it messages through its :meth:`streams` and call :meth:`poll` after each. Messages that
+    cannot be used are dropped and counted; nothing is raised. Time is the time of the stamps: an image is dropped once any
+    input is ``max_wait_s`` (for a transform: ``tf_timeout_s``) past it, which bounds the memory. If a stamp goes back more
+    than three seconds (a looped recording, a restarted simulation), waiting images are paired or dropped and pairing goes
+    on from the new time. A camera model is valid from its stamp until a different one comes. Several cameras share the poses
     and the clock; their frames come in the order of their stamps. Not thread-safe: callers hold a lock.
     """
 
@@ -37,7 +37,7 @@ class FramePairer:
 
         Args:
             config: Topics, pose source, mounting of the cameras.
-            transforms: TF, which some pose and extrinsic sources need.
+            transforms: TF, needed by some pose and extrinsic sources.
 
         Raises:
             ConfigError: ``input.T_body_camera`` or ``input.T_rgb_depth`` is not a pose, or TF is needed and not given.
@@ -63,55 +63,30 @@ class FramePairer:
         self._ready: list[PairedMessages] = []
 
     @property
-    def received(self) -> Counter[str]:
-        """Messages per topic, usable or not."""
-        return self._tally.received
-
-    @property
     def drops(self) -> Counter[str]:
         """Messages and colour images that led to no frame, by reason.
 
         ``unknown_encoding``, ``bad_image``, ``size_mismatch``, ``bad_intrinsics``, ``bad_pose``, ``bad_transform``,
         ``wrong_frame``, ``stamp_backwards``, ``stamp_repeated``, ``no_camera_info``, ``no_depth``, ``no_pose``,
-        ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without loss of a frame:
+        ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without losing a frame:
         ``time_jump``, ``intrinsics_changed``, ``frame_id_changed``.
         """
         return self._tally.drops
 
     @property
     def last_drop(self) -> dict[str, str]:
-        """The latest explanation of each reason; names the topic."""
+        """Explanation of the latest drop of each reason; it names the topic."""
         return self._tally.last_drop
 
-    @property
-    def waiting(self) -> int:
-        """Messages that are kept: images that wait, and poses."""
-        return sum(camera.waiting for camera in self._cameras) + len(self._buffered) + len(self._held)
-
-    def streams(self) -> list[InputStream]:
-        """Every topic to listen to, but for TF: those of the cameras, then the poses."""
+    def streams(self) -> list[Stream]:
+        """List every topic to listen to except TF: those of the cameras, then the poses."""
         streams = [stream for camera in self._cameras for stream in camera.streams()]
         msgtype = pose_type(self._config)
         if msgtype is not None:
             parameter = f"input.{pose_parameter(self._config)}"
-            streams.append(InputStream(pose_topic(self._config), msgtype, parameter, self._config.pose_qos, self.add_pose))
+            topic, profile = pose_topic(self._config), self._config.pose_qos
+            streams.append(Stream(topic, "pose", msgtype, parameter, profile, self.add_pose))
         return streams
-
-    def add_rgb(self, message: Any, camera: int = 0) -> None:
-        """Take a colour image (``sensor_msgs/Image`` or ``CompressedImage``) of the camera of that number."""
-        self._cameras[camera].add_rgb(message)
-
-    def add_depth(self, message: Any, camera: int = 0) -> None:
-        """Take a depth image (``sensor_msgs/Image`` or ``CompressedImage``)."""
-        self._cameras[camera].add_depth(message)
-
-    def add_camera_info(self, message: Any, camera: int = 0) -> None:
-        """Take the camera model of the colour images (``sensor_msgs/CameraInfo``)."""
-        self._cameras[camera].add_camera_info(message)
-
-    def add_depth_camera_info(self, message: Any, camera: int = 0) -> None:
-        """Take the camera model of depth images that are not registered (``sensor_msgs/CameraInfo``)."""
-        self._cameras[camera].add_depth_camera_info(message)
 
     def add_pose(self, message: Any) -> None:
         """Take a pose of the body in the map frame.
@@ -120,7 +95,6 @@ class FramePairer:
             message: ``geometry_msgs/PoseStamped``, ``PoseWithCovarianceStamped`` or ``nav_msgs/Odometry``.
         """
         topic = pose_topic(self._config)
-        self._tally.received[topic] += 1
         frame = message.header.frame_id
         try:
             if frame.lstrip("/") != self._config.map_frame.lstrip("/"):
@@ -128,7 +102,7 @@ class FramePairer:
                     f"{topic}: pose is in frame '{frame}', but parameter 'input.map_frame' is '{self._config.map_frame}'",
                     reason="wrong_frame",
                 )
-            T_world_body = messages.to_pose(message, topic)
+            T_world_body = to_pose(message, topic)
             stamp_ns = self._timeline.advance(topic, message)
         except FrameError as error:
             self.drop(error)
@@ -137,18 +111,18 @@ class FramePairer:
         self._buffered.add(stamp_ns, T_world_body)
 
     def poll(self) -> list[PairedMessages]:
-        """The pairs that have become complete since the last call, in stamp order (between two time jumps)."""
+        """Return the pairs completed since the last call, in stamp order (between two time jumps)."""
         self._settle(final=False)
         ready, self._ready = self._ready, []
         return ready
 
     def flush(self) -> list[PairedMessages]:
-        """As :meth:`poll`, when nothing more will come: what still waits is paired with what is there, or dropped."""
+        """Return the last pairs when no more messages will come: what waits is paired with what is there, or dropped."""
         self._settle(final=True)
         return self.poll()
 
     def reset(self) -> None:
-        """Forget everything that waits and the stamps seen; the camera models and the counts stay."""
+        """Remove everything that waits and the stamps seen; camera models and counts stay."""
         self._ready.clear()
         self._held.clear()
         self._timeline.clear()
@@ -168,7 +142,7 @@ class FramePairer:
         for camera in self._cameras:
             self._held += camera.settle(final)
         self._held.sort(key=lambda paired: paired.stamp_ns)
-        # A frame goes on once no camera has an earlier image that may yet become one.
+        # A frame is ready once no camera has an earlier image that may still become a frame.
         waiting = [camera.oldest_ns for camera in self._cameras if camera.oldest_ns is not None]
         earliest_ns = min(waiting, default=None)
         while self._held and (earliest_ns is None or self._held[0].stamp_ns <= earliest_ns):

@@ -1,4 +1,4 @@
-"""Where the pose of a camera comes from: buffered messages or TF, and how the camera is mounted on what has that pose."""
+"""Sources of the body's pose (messages or TF), and the mounting of each camera on the body."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.fields import transform_from
 from fus3dmaps_core.sources.streams import pose_topic
 from fus3dmaps_core.sources.timeline import seconds
 from fus3dmaps_core.sources.transforms import NoTransform, TransformBuffer, TransformGap
 
 FOREVER_NS = 2**63
-"""How long an image has waited when nothing more will come."""
+"""Waiting time of an image when no more messages will come."""
 
 _REASONS = {
     TransformGap.UNKNOWN_FRAME: "tf_unknown_frame",
@@ -38,7 +38,7 @@ class Moment:
         topic: Topic of the image, for error messages.
         frame: Optical frame of its camera in TF.
         stamp_ns: Its stamp, nanoseconds.
-        waited_ns: How far other inputs are past it, nanoseconds.
+        waited_ns: How far the other inputs are past its stamp, nanoseconds.
     """
 
     topic: str
@@ -51,11 +51,11 @@ class PoseProvider(Protocol):
     """Poses of the body in the map frame over time."""
 
     def body_frame(self, moment: Moment) -> str:
-        """Name of the body's frame in TF; empty where nobody has named it."""
+        """Return the name of the body's frame in TF; empty if it is not known."""
         ...
 
     def at(self, moment: Moment) -> NDArray[np.float64] | None:
-        """T_world_body at an image's stamp, (4, 4) float64; None while it may still come.
+        """Return T_world_body at an image's stamp, (4, 4) float64, or None while it may still come.
 
         Raises:
             FrameError: It will not come: reasons ``no_pose``, ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected`` or
@@ -64,11 +64,11 @@ class PoseProvider(Protocol):
         ...
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Forget what no image of this stamp or later needs."""
+        """Remove poses that no image of this stamp or later needs."""
         ...
 
     def clear(self) -> None:
-        """Forget every pose: time starts anew."""
+        """Remove all poses, because time restarts."""
         ...
 
 
@@ -76,7 +76,7 @@ class BufferedPoses:
     """Poses that came as messages, interpolated. Images wait for them up to ``input.max_wait_s``.
 
     Attributes:
-        child_frame: What the latest odometry called the body; empty for other messages.
+        child_frame: Name of the body in the latest odometry; empty for other messages.
     """
 
     def __init__(self, config: InputConfig) -> None:
@@ -87,20 +87,16 @@ class BufferedPoses:
         self._buffer = PoseBuffer(config.max_pose_gap_s)
         self.child_frame = ""
 
-    def __len__(self) -> int:
-        """Number of poses held."""
-        return len(self._buffer)
-
     def add(self, stamp_ns: int, T_world_body: NDArray[np.float64]) -> None:
         """Append a pose whose stamp is later than that of every pose before."""
         self._buffer.add(stamp_ns, T_world_body)
 
     def body_frame(self, moment: Moment) -> str:
-        """``input.body_frame``, else what the odometry says."""
+        """Return ``input.body_frame``, or the name in the odometry if that is empty."""
         return self._config.body_frame or self.child_frame
 
     def at(self, moment: Moment) -> NDArray[np.float64] | None:
-        """As :class:`PoseProvider` says."""
+        """Return T_world_body at an image's stamp; see :class:`PoseProvider`."""
         found = self._buffer.lookup(moment.stamp_ns)
         if not isinstance(found, PoseGap):
             return found
@@ -119,45 +115,45 @@ class BufferedPoses:
         )
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Forget what no image of this stamp or later needs."""
+        """Remove poses that no image of this stamp or later needs."""
         self._buffer.forget_before(stamp_ns)
 
     def clear(self) -> None:
-        """Forget every pose."""
+        """Remove all poses."""
         self._buffer.clear()
 
 
 class TransformPoses:
-    """Poses looked up in TF at the image's stamp: of ``input.body_frame``, or of the camera itself where that is empty.
+    """Poses of ``input.body_frame``, looked up in TF at the image's stamp; if that is empty, of the camera itself.
 
     Images wait for them up to ``input.tf_timeout_s``.
     """
 
     def __init__(self, config: InputConfig, transforms: TransformBuffer) -> None:
-        """Look up in ``transforms``."""
+        """Use ``transforms`` for the lookups."""
         self._config = config
         self._transforms = transforms
 
     def body_frame(self, moment: Moment) -> str:
-        """``input.body_frame``, else the camera's own frame."""
+        """Return ``input.body_frame``, or the camera's own frame if that is empty."""
         return self._config.body_frame or moment.frame
 
     def at(self, moment: Moment) -> NDArray[np.float64] | None:
-        """As :class:`PoseProvider` says."""
+        """Return T_world_body at an image's stamp; see :class:`PoseProvider`."""
         return transform_at(self._transforms, self._config, self._config.map_frame, self.body_frame(moment), moment)
 
     def forget_before(self, stamp_ns: int) -> None:
-        """Nothing to do: the buffer bounds itself."""
+        """Do nothing: the buffer bounds itself."""
 
     def clear(self) -> None:
-        """Forget what moved."""
+        """Remove all moving transforms."""
         self._transforms.clear()
 
 
 class Mounting:
-    """How one camera is mounted: T_body_camera and T_rgb_depth, given as parameters or looked up in TF.
+    """The mounting of one camera: T_body_camera and T_rgb_depth, from parameters or from TF.
 
-    Lookups are made at each image's stamp, which serves cameras on a moving neck as well as fixed ones.
+    TF is asked at each image's stamp, so a camera on a moving neck works as well as a fixed one.
     """
 
     def __init__(self, config: InputConfig, index: int, transforms: TransformBuffer | None) -> None:
@@ -165,8 +161,8 @@ class Mounting:
 
         Args:
             config: The inputs.
-            index: Which of the cameras it is.
-            transforms: Where to look up, if ``input.extrinsic_source`` says so.
+            index: Number of the camera.
+            transforms: TF, used if ``input.extrinsic_source`` is ``tf``.
 
         Raises:
             ConfigError: A parameter is not a pose; the message names it.
@@ -177,7 +173,7 @@ class Mounting:
         self._T_rgb_depth = _pose_parameter("T_rgb_depth", config.T_rgb_depth, index)
 
     def body_camera(self, moment: Moment, body_frame: str) -> NDArray[np.float64] | None:
-        """T_body_camera, (4, 4) float64; None while it may still come.
+        """Return T_body_camera, (4, 4) float64, or None while it may still come.
 
         Raises:
             FrameError: As :meth:`PoseProvider.at`.
@@ -187,7 +183,7 @@ class Mounting:
         return transform_at(self._transforms, self._config, body_frame, moment.frame, moment)
 
     def rgb_depth(self, moment: Moment, depth_frame: str) -> NDArray[np.float64] | None:
-        """T_rgb_depth, (4, 4) float64; None while it may still come.
+        """Return T_rgb_depth, (4, 4) float64, or None while it may still come.
 
         Raises:
             FrameError: As :meth:`PoseProvider.at`.
@@ -200,7 +196,7 @@ class Mounting:
 def transform_at(
     transforms: TransformBuffer, config: InputConfig, target_frame: str, source_frame: str, moment: Moment
 ) -> NDArray[np.float64] | None:
-    """T_target_source at an image's stamp, None while it may still come within ``input.tf_timeout_s``.
+    """Return T_target_source at an image's stamp, or None while it may still come within ``input.tf_timeout_s``.
 
     Raises:
         FrameError: As :meth:`PoseProvider.at`; the message names both frames.
@@ -228,6 +224,6 @@ def transform_at(
 def _pose_parameter(name: str, values: list[float], index: int) -> NDArray[np.float64]:
     own = values if len(values) == 7 else values[7 * index : 7 * index + 7]
     try:
-        return messages.transform_from(own)
+        return transform_from(own)
     except FrameError as error:
         raise ConfigError(f"parameter 'input.{name}': {error}") from None

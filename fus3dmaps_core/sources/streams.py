@@ -1,10 +1,10 @@
-"""Which topics the inputs come on, of which message type, and where their messages go, live and recorded alike."""
+"""The input topics of the map: their names, message types and QoS, the same for the live node and for recordings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 from fus3dmaps_core.config.input import InputConfig, QosProfile
 
@@ -15,23 +15,60 @@ _POSE_TYPES = {
 }
 
 
+class Qos(NamedTuple):
+    """What a subscription asks of publishers, by ROS's names.
+
+    Attributes:
+        reliability: ``RELIABLE``, ``BEST_EFFORT`` or ``BEST_AVAILABLE``.
+        durability: ``TRANSIENT_LOCAL``, ``VOLATILE`` or ``BEST_AVAILABLE``.
+    """
+
+    reliability: str
+    durability: str
+
+
+QOS_PROFILES: dict[QosProfile, Qos] = {
+    "sensor_data": Qos("BEST_EFFORT", "VOLATILE"),
+    "reliable": Qos("RELIABLE", "VOLATILE"),
+    "transient_local": Qos("RELIABLE", "TRANSIENT_LOCAL"),
+    "best_available": Qos("BEST_AVAILABLE", "BEST_AVAILABLE"),
+}
+
+
 @dataclass(frozen=True)
-class InputStream:
-    """One topic that is listened to.
+class Stream:
+    """One input topic of the map.
 
     Attributes:
         topic: Its name as configured, with camera and transport.
+        role: What its messages are.
         msgtype: Message type, e.g. ``sensor_msgs/msg/Image``.
         parameter: Key of the parameter that names the topic.
-        qos: Profile by which it is subscribed to.
+        profile: QoS profile of the subscription.
         add: Takes a message.
     """
 
     topic: str
+    role: Literal["rgb", "depth", "pose", "camera_info"]
     msgtype: str
     parameter: str
-    qos: QosProfile
+    profile: QosProfile
     add: Callable[[Any], None]
+
+    @property
+    def qos(self) -> Qos:
+        """Reliability and durability of the profile."""
+        return QOS_PROFILES[self.profile]
+
+    @property
+    def qos_parameter(self) -> str:
+        """Key of the parameter that chooses the profile."""
+        return f"input.{self.role}_qos"
+
+    @property
+    def once(self) -> bool:
+        """Whether one message is enough, as for a latched camera model: silence after it is no problem."""
+        return self.role == "camera_info"
 
 
 @dataclass(frozen=True)
@@ -42,7 +79,7 @@ class CameraTopics:
         rgb: Colour images, with the transport's suffix.
         depth: Depth images, with the transport's suffix.
         camera_info: Camera model of the colour images.
-        depth_camera_info: Camera model of the depth images, None where they are registered to colour.
+        depth_camera_info: Camera model of the depth images, None if they are registered to colour.
     """
 
     rgb: str
@@ -52,7 +89,7 @@ class CameraTopics:
 
 
 def camera_topics(config: InputConfig) -> list[CameraTopics]:
-    """The topics of each camera, in the order in which ``input.cameras`` names them."""
+    """Return the topics of each camera, in the order of ``input.cameras``."""
     topics = []
     for name in config.camera_names:
         namespace = f"{name}/" if name else ""
@@ -68,30 +105,30 @@ def camera_topics(config: InputConfig) -> list[CameraTopics]:
 
 
 def image_type(transport: str) -> str:
-    """Message type of images of a transport."""
+    """Return the message type of images of a transport."""
     return "sensor_msgs/msg/Image" if transport == "raw" else "sensor_msgs/msg/CompressedImage"
 
 
 def pose_parameter(config: InputConfig) -> str:
-    """Name of the field of the configuration that holds the topic of the poses; of no use with TF."""
+    """Return the name of the configuration field that holds the pose topic; has no meaning with TF."""
     return f"{config.pose_source}_topic"
 
 
 def pose_topic(config: InputConfig) -> str:
-    """Topic of the poses; ``TF`` where they come from there."""
+    """Return the topic of the poses, or ``TF`` if they come from there."""
     return "TF" if config.pose_source == "tf" else str(getattr(config, pose_parameter(config)))
 
 
 def pose_type(config: InputConfig) -> str | None:
-    """Message type of the poses, None where they come from TF."""
+    """Return the message type of the poses, None if they come from TF."""
     return _POSE_TYPES.get(config.pose_source)
 
 
 def uses_tf(config: InputConfig) -> bool:
-    """Whether poses or extrinsics are looked up in TF."""
+    """Return whether poses or extrinsics are looked up in TF."""
     return "tf" in (config.pose_source, config.extrinsic_source)
 
 
 def _with_transport(topic: str, transport: str) -> str:
-    """The name under which image_transport publishes."""
+    """Return the name under which image_transport publishes."""
     return topic if transport == "raw" or topic.endswith(f"/{transport}") else f"{topic}/{transport}"

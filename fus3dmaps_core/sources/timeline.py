@@ -1,4 +1,4 @@
-"""What the inputs of a map have in common: their clock, and the counts of what came and what could not be used."""
+"""The shared clock of all inputs of a map, and the counts of messages that could not be used."""
 
 from __future__ import annotations
 
@@ -8,22 +8,20 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
 
-_TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours; only another clock or a restart goes back this far.
+_TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours. Only another clock or a restart goes back this far.
 
 
 @dataclass
 class Tally:
-    """Counts of messages.
+    """Counts of dropped messages.
 
     Attributes:
-        received: Messages per topic, usable or not.
-        drops: What led to no frame or was noteworthy, by reason.
-        last_drop: The latest explanation of each reason; names the topic.
+        drops: Messages that led to no frame, and events worth noting, by reason.
+        last_drop: Explanation of the latest drop of each reason; it names the topic.
     """
 
-    received: Counter[str] = field(default_factory=Counter)
     drops: Counter[str] = field(default_factory=Counter)
     last_drop: dict[str, str] = field(default_factory=dict)
 
@@ -34,10 +32,12 @@ class Tally:
 
 
 class Timeline:
-    """The stamps of all inputs. Each topic's rise; one that goes far back starts time anew for all of them.
+    """The stamps of all inputs.
+
+    The stamps of each topic must rise. A stamp that goes far back restarts time for all topics.
 
     Attributes:
-        last_ns: Latest stamp of each topic since time started.
+        last_ns: Latest stamp of each topic since time (re)started.
     """
 
     def __init__(self, tally: Tally, settle: Callable[[], None], forget: Callable[[], None]) -> None:
@@ -45,8 +45,8 @@ class Timeline:
 
         Args:
             tally: Counts ``time_jump``.
-            settle: Called before time starts anew: what waits is to be paired or dropped.
-            forget: Called then: what was kept of the old time is to go.
+            settle: Called before time restarts, to pair or drop what waits.
+            forget: Called after that, to remove what belongs to the old time.
         """
         self._tally = tally
         self._settle = settle
@@ -55,16 +55,19 @@ class Timeline:
 
     @property
     def newest_ns(self) -> int:
-        """Latest stamp of all."""
+        """Latest stamp of all topics; 0 without any."""
         return max(self.last_ns.values(), default=0)
 
     def advance(self, topic: str, message: Any) -> int:
-        """The message's stamp, which must be later than the topic's last one unless time has jumped back.
+        """Take a message's stamp, which must be later than the topic's last one unless time has jumped back.
+
+        Returns:
+            The stamp, nanoseconds.
 
         Raises:
             FrameError: Reason ``stamp_backwards`` or ``stamp_repeated``.
         """
-        stamp_ns = messages.stamp_ns(message)
+        stamp_ns = fields.stamp_ns(message)
         last_ns = self.last_ns.get(topic)
         if last_ns is not None and stamp_ns <= last_ns:
             back_s = (last_ns - stamp_ns) / 1e9
@@ -82,11 +85,11 @@ class Timeline:
         return stamp_ns
 
     def clear(self) -> None:
-        """Start time anew."""
+        """Restart time."""
         self.last_ns.clear()
         self._forget()
 
 
 def seconds(stamp_ns: int) -> str:
-    """A stamp in words."""
+    """Format a stamp as seconds."""
     return f"{stamp_ns // 1_000_000_000}.{stamp_ns % 1_000_000_000:09d}"

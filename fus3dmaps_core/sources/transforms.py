@@ -1,4 +1,4 @@
-"""Transforms between frames over time: the interface to TF, and a buffer of our own for recordings, where no ROS runs."""
+"""Transforms between frames over time: the interface to TF, and a buffer for recordings, which are read without ROS."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
 
 _KEEP_NS = 10_000_000_000  # As tf2 does: longer than any image waits.
 _TIME_JUMP_NS = 3_000_000_000
 
 
 class TransformGap(Enum):
-    """Why a transform is not known at a stamp. What comes after the last, or is not known at all, may still come."""
+    """Why a transform is not known at a stamp. It may still come if it is after the last one or not known at all."""
 
     UNKNOWN_FRAME = "nobody publishes this frame"
     NOT_CONNECTED = "the frames are not connected"
@@ -30,11 +30,11 @@ class TransformGap(Enum):
 
 @dataclass(frozen=True)
 class NoTransform:
-    """The answer where there is no transform.
+    """The result of a lookup that found no transform.
 
     Attributes:
-        gap: Why.
-        detail: The same in words, naming frames.
+        gap: The reason.
+        detail: The reason in words, with the names of frames.
     """
 
     gap: TransformGap
@@ -42,10 +42,10 @@ class NoTransform:
 
 
 class TransformBuffer(Protocol):
-    """What TF knows. tf2's buffer behind an adapter on a robot, :class:`TransformTree` for recordings."""
+    """The transforms known so far: an adapter of tf2's buffer on a robot, :class:`TransformTree` for recordings."""
 
     def lookup(self, target_frame: str, source_frame: str, stamp_ns: int) -> NDArray[np.float64] | NoTransform:
-        """The transform at a stamp; never waits.
+        """Look up the transform at a stamp, without waiting.
 
         Args:
             target_frame: Frame into which points are transformed.
@@ -58,33 +58,33 @@ class TransformBuffer(Protocol):
         ...
 
     def clear(self) -> None:
-        """Forget what moved; static transforms stay."""
+        """Remove all moving transforms; static ones stay."""
         ...
 
 
 class TransformTree:
-    """Transforms of ``tf2_msgs/TFMessage``, each edge interpolated on its own, chains through common ancestors.
+    """Transforms of ``tf2_msgs/TFMessage``: every edge is interpolated, and frames are joined at their common ancestor.
 
-    A frame that is given a new parent continues under that one alone. Not thread-safe.
+    A frame that gets a new parent loses the old one. Not thread-safe.
     """
 
     def __init__(self, max_gap_s: float) -> None:
-        """Start empty; transforms of one edge that are farther apart than ``max_gap_s`` seconds are not interpolated."""
+        """Start empty. Transforms of one edge that are more than ``max_gap_s`` seconds apart are not interpolated."""
         self._max_gap_s = max_gap_s
         self._parents: dict[str, str] = {}
         self._moving: dict[str, PoseBuffer] = {}
         self._static: dict[str, NDArray[np.float64]] = {}
 
     def add(self, message: Any, topic: str, *, static: bool) -> list[FrameError]:
-        """Take what a message holds.
+        """Add the transforms of a message.
 
         Args:
             message: ``tf2_msgs/TFMessage``.
             topic: Where it came from, for error messages.
-            static: Whether it holds at all times, as what comes on ``/tf_static`` does.
+            static: Whether its transforms hold at all times, like those on ``/tf_static``.
 
         Returns:
-            What cannot be used of it, reason ``bad_transform``; the rest was taken.
+            One error with reason ``bad_transform`` for each transform that cannot be used; the others were added.
         """
         refused = []
         for stamped in message.transforms:
@@ -95,7 +95,7 @@ class TransformTree:
         return refused
 
     def lookup(self, target_frame: str, source_frame: str, stamp_ns: int) -> NDArray[np.float64] | NoTransform:
-        """As :class:`TransformBuffer` says."""
+        """Look up the transform at a stamp; see :class:`TransformBuffer`."""
         target, source = _plain(target_frame), _plain(source_frame)
         if target == source:
             return np.eye(4)
@@ -116,7 +116,7 @@ class TransformTree:
         return np.asarray(np.linalg.inv(T_common_target) @ T_common_source)
 
     def clear(self) -> None:
-        """Forget what moved; static transforms stay."""
+        """Remove all moving transforms; static ones stay."""
         for frame in self._moving:
             del self._parents[frame]
         self._moving.clear()
@@ -127,7 +127,7 @@ class TransformTree:
             raise FrameError(f"{topic}: transform from '{child}' to '{parent}'")
         if child in self._ancestors(parent):
             raise FrameError(f"{topic}: transform from '{child}' to '{parent}' closes a loop")
-        T_parent_child = messages.transform_of(stamped, topic)
+        T_parent_child = fields.transform_of(stamped, topic)
         if self._parents.get(child) != parent or static != (child in self._static):
             self._moving.pop(child, None)
             self._static.pop(child, None)
@@ -136,23 +136,23 @@ class TransformTree:
             self._static[child] = T_parent_child
             return
         buffer = self._moving.setdefault(child, PoseBuffer(self._max_gap_s))
-        stamp_ns = messages.stamp_ns(stamped)
+        stamp_ns = fields.stamp_ns(stamped)
         if buffer.last_ns is not None and stamp_ns <= buffer.last_ns:
             if buffer.last_ns - stamp_ns <= _TIME_JUMP_NS:
-                return  # Publishers repeat transforms; it is no fault.
+                return  # Publishers repeat transforms; that is no fault.
             buffer.clear()
         buffer.add(stamp_ns, T_parent_child)
         buffer.forget_before(stamp_ns - _KEEP_NS)
 
     def _ancestors(self, frame: str) -> list[str]:
-        """The frame, its parent and so on, up to the root."""
+        """List the frame, its parent and so on, up to the root."""
         chain = [frame]
         while chain[-1] in self._parents:
             chain.append(self._parents[chain[-1]])
         return chain
 
     def _climb(self, frames: list[str], stamp_ns: int) -> NDArray[np.float64] | NoTransform:
-        """From the first of the frames to the parent of the last."""
+        """Chain the transforms from the first frame to the parent of the last."""
         T = np.eye(4)
         for frame in frames:
             edge = self._static[frame] if frame in self._static else self._moving[frame].lookup(stamp_ns)
@@ -164,5 +164,5 @@ class TransformTree:
 
 
 def _plain(frame: str) -> str:
-    """The name as tf2 wants it; ROS 1 wrote a slash before it."""
+    """Return the name as tf2 expects it; ROS 1 wrote a slash before it."""
     return frame.lstrip("/")

@@ -1,1 +1,1 @@
-"""Published datasets, each in its own folder layout, as posed frames with their labels."""
+"""Readers of published datasets: posed frames with their labels, each dataset in its own folder layout."""

@@ -13,7 +13,7 @@ from fus3dmaps_lab.datasets.registry import open_dataset
 
 @dataclass(frozen=True)
 class ConversionSummary:
-    """What a conversion wrote.
+    """Summary of a conversion.
 
     Attributes:
         frames: Number of frames.
@@ -40,15 +40,15 @@ def convert(
 
     Args:
         layout: One of :func:`fus3dmaps_lab.datasets.registry.names`.
-        directory: Where the dataset is.
-        out: Recording to write, must end in ``.mcap``; appears only if the conversion succeeds.
+        directory: Folder of the dataset.
+        out: Recording to write, must end in ``.mcap``. It is created only if the conversion succeeds.
         config: Topics and frames of the recording.
         overwrite: Whether an existing file is replaced.
-        on_progress: Called after each frame with the number done and the number of all.
-        options: Of the dataset, e.g. ``scene`` or ``stride``.
+        on_progress: Called after each frame with the number of frames done and of all frames.
+        options: Options of the dataset, e.g. ``scene`` or ``stride``.
 
     Raises:
-        RecordingError: The dataset cannot be read or the recording not be written; the message names the file.
+        RecordingError: The dataset cannot be read or the recording cannot be written; the message names the file.
         ConfigError: An option is unknown or of the wrong type.
     """
     dataset = open_dataset(layout, directory, **(options or {}))

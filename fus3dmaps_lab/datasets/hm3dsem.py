@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -22,7 +23,6 @@ from fus3dmaps_lab.datasets.files import (
     read_text,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.poses import FROM_OPENGL
 from fus3dmaps_lab.datasets.protocols import Labels
@@ -36,16 +36,16 @@ _BACKGROUND = frozenset({"wall", "floor", "ceiling", "door", "window", "backgrou
 class Hm3dSem(ImageSequence):
     """One walk: ``rgb/NAME_NNNNNN.png``, ``depth/NAME_NNNNNN.png``, ``pose/NAME_NNNNNN.txt``, ``semantic/NAME_NNNNNN.npy``.
 
-    NAME is the scene's hash and may be missing; a - may stand for the _. HOV-SG's generator writes 1080x720 images of a
-    camera that sees 90 degrees across, with its axis through the middle: fx = fy = width / 2, cx = (width - 1) / 2, cy =
-    (height - 1) / 2. Depth is 16-bit millimetres along the axis, 0 without a reading. A pose file is one line, a camera-to-
-    world matrix row by row, metres, of a camera that looks along -z with y up, as Habitat's do; it is turned here into the
-    optical frame. The world stays Habitat's: y points up. Stamps follow from the frame numbers at 30 Hz.
+    NAME is the scene's hash and may be missing; a - may replace the _. HOV-SG's generator writes 1080x720 images with a
+    horizontal field of view of 90 degrees and a centred axis: fx = fy = width / 2, cx = (width - 1) / 2, cy =
+    (height - 1) / 2. Depth is 16-bit millimetres along the axis, 0 without a reading. A pose file is one line: a camera-to-
+    world matrix row by row, metres. Its camera looks along -z with y up, as in Habitat; the poses are turned into the
+    optical frame here. The world remains Habitat's, where y points up. Stamps follow from the frame numbers at 30 Hz.
 
-    Semantic images are object ids. ``HASH.semantic.txt`` of the HM3D release (``id,COLOUR,"category",region`` a line), in
-    the walk's folder or given, names the category of each. With ``categories``, Habitat's
-    ``matterport_category_mappings.tsv`` or Matterport3D's ``category_mapping.tsv``, categories become the 40 Matterport
-    classes (``mpcat40``), else each category is a class.
+    Semantic images hold object ids. ``HASH.semantic.txt`` of the HM3D release (lines of ``id,COLOUR,"category",region``), in
+    the walk's folder or at ``objects``, names the category of each. With the table ``categories`` (Habitat's
+    ``matterport_category_mappings.tsv`` or Matterport3D's ``category_mapping.tsv``), categories become the 40 Matterport
+    classes (``mpcat40``); without it, each category is a class.
     """
 
     name = "hm3dsem"
@@ -54,13 +54,13 @@ class Hm3dSem(ImageSequence):
         """List the frames and read poses and classes.
 
         Args:
-            directory: Of one walk, e.g. ``hm3dsem_walks/val/00824-Dd4bFSTQ8gi``.
-            stride: Every n-th frame is taken.
-            objects: Path of ``HASH.semantic.txt``, where it does not lie in the walk's folder.
-            categories: Path of the table; without, either is looked for in the walk's folder and the two above.
+            directory: Folder of one walk, e.g. ``hm3dsem_walks/val/00824-Dd4bFSTQ8gi``.
+            stride: Take every n-th frame.
+            objects: Path of ``HASH.semantic.txt``, if it is not in the walk's folder.
+            categories: Path of the table; if empty, either one is looked for in the walk's folder and the two above.
 
         Raises:
-            RecordingError: A file is missing or odd; the message names it.
+            RecordingError: A file is missing or invalid; the message names it.
         """
         require_directory(directory, "a walk through an HM3DSem scene")
         walk = directory.resolve()
@@ -73,7 +73,7 @@ class Hm3dSem(ImageSequence):
             T_world_optical = checked_pose(read_matrix(pose_file, 4), f"'{pose_file}'") @ FROM_OPENGL
             depth = require_file(walk / "depth" / color.name)
             ids = _semantic_file(walk / "semantic", color.stem) if semantic else None
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T_world_optical, ids, ids))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T_world_optical, ids, ids))
         self._table, labels = np.zeros(1, np.int32), Labels()
         if semantic and objects_file is not None:
             self._table, labels = _classes_of(objects_file, _mapping_file(walk, categories))
@@ -118,7 +118,7 @@ def _mapping_file(walk: Path, given: str) -> Path | None:
 
 
 def _classes_of(objects_file: Path, mapping_file: Path | None) -> tuple[NDArray[np.int32], Labels]:
-    """Class by object id, and the classes, in the order of their names."""
+    """Return the class of each object id, and the classes in the order of their names."""
     category_of_object: dict[int, str] = {}
     for number, row in enumerate(csv.reader(read_text(objects_file).splitlines()), start=1):
         if number == 1 and row and row[0].startswith("HM3D Semantic"):
@@ -137,7 +137,7 @@ def _classes_of(objects_file: Path, mapping_file: Path | None) -> tuple[NDArray[
 
 
 def _mapping(path: Path) -> dict[str, str]:
-    # Habitat's copy of the table parts its columns by four spaces, Matterport's own by a tab.
+    # Habitat's copy of the table separates columns by four spaces, Matterport's own by a tab.
     rows = csv.DictReader(read_text(path).replace("    ", "\t").splitlines(), delimiter="\t")
     if not {"raw_category", "mpcat40"} <= set(rows.fieldnames or ()):
         raise RecordingError(f"'{path}' has no columns raw_category and mpcat40")

@@ -1,4 +1,4 @@
-"""Binary PLY meshes with the properties that semantic datasets add to vertices and faces, which mesh libraries leave out."""
+"""Reading of binary PLY meshes with all properties of vertices and faces, also labels, which mesh libraries leave out."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ class _Property:
 
 
 def read_ply(path: Path) -> dict[str, NDArray[np.void]]:
-    """Elements of a little-endian PLY by name, each a structured array with its properties.
+    """Read the elements of a little-endian PLY by name, each as a structured array with its properties.
 
-    A property that is a list must have one length throughout, as the corners have in meshes of triangles or of quads; it
-    becomes a field of that many columns.
+    A list property must have the same length in all elements, like the corners in a mesh of triangles or of quads. It
+    becomes a field with that many columns.
 
     Raises:
-        RecordingError: The file cannot be read, is truncated, is of another format, or has lists of several lengths.
+        RecordingError: The file cannot be read, is truncated, is of another format, or has lists of different lengths.
     """
     try:
         data = path.read_bytes()
@@ -76,7 +76,7 @@ def _header(text: str, path: Path) -> list[tuple[str, int, list[_Property]]]:
 
 
 def _fields(properties: list[_Property], data: bytes, at: int | None, path: Path) -> list[tuple[str, str, tuple[int, ...]]]:
-    """Fields of an element whose first one lies at byte ``at``, None if there are none; '#NAME' counts the list NAME."""
+    """Lay out the fields of an element whose first one is at byte ``at``; None without any. '#NAME' counts list NAME."""
     fields: list[tuple[str, str, tuple[int, ...]]] = []
     for item in properties:
         length: tuple[int, ...] = ()

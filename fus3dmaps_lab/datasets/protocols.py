@@ -1,4 +1,4 @@
-"""What a dataset is to the rest: a scene's posed frames, and where it has them, the true classes of its pixels."""
+"""The interface of all datasets: the posed frames of a scene and, if it has them, the true classes of its pixels."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 
 TruePoints = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]
-"""(n, 3) metres in the frame of the poses, (n,) class ids, (n,) instance ids; 0 where unlabelled or of no instance."""
+"""(n, 3) metres in the frame of the poses, (n,) class ids, (n,) instance ids; 0 is unlabelled or no instance."""
 
 
 @dataclass(frozen=True)
 class Labels:
-    """The classes that a scene's labels tell apart.
+    """The classes of a scene's labels.
 
     Attributes:
-        class_names: Index is the class id; 0 means unlabelled, and its name is empty.
-        background: Ids of the classes that are left out where background does not count.
+        class_names: Name by class id; 0 means unlabelled, and its name is empty.
+        background: Ids of the classes that are left out if background does not count.
     """
 
     class_names: tuple[str, ...] = ("",)
@@ -29,16 +29,16 @@ class Labels:
 
     @classmethod
     def of(cls, names: list[str], background: frozenset[str]) -> Labels:
-        """Classes 1, 2, ... with these names, of which those in ``background`` are background."""
+        """Assign the numbers 1, 2, ... to classes with these names; those named in ``background`` are background."""
         return cls(("", *names), frozenset(i for i, name in enumerate(names, start=1) if name in background))
 
 
 class Dataset(Protocol):
-    """A scene of posed RGB-D frames; iterating twice gives the same frames twice."""
+    """A scene of posed RGB-D frames; every iteration gives the same frames."""
 
     @property
     def name(self) -> str:
-        """Name of the layout, as the registry knows it."""
+        """Name of the layout in the registry."""
         ...
 
     @property
@@ -52,33 +52,33 @@ class Dataset(Protocol):
         ...
 
     def __len__(self) -> int:
-        """Number of frames that are yielded."""
+        """Count the frames that an iteration yields."""
         ...
 
     def __iter__(self) -> Iterator[PosedFrame]:
-        """The frames in order of their stamps.
+        """Yield the frames in order of their stamps.
 
         Raises:
-            RecordingError: A file cannot be read or holds something else than it should; the message names the file.
+            RecordingError: A file cannot be read or has the wrong content; the message names the file.
         """
         ...
 
 
 class LabelledDataset(Dataset, Protocol):
-    """A scene whose true classes are known, by pixel or by surface point."""
+    """A scene whose true classes are known, for pixels or for surface points."""
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Index is the class id; 0 means unlabelled, and its name is empty."""
+        """Name by class id; 0 means unlabelled, and its name is empty."""
         ...
 
     @property
     def background(self) -> frozenset[int]:
-        """Ids of wall, floor, ceiling and their like."""
+        """Ids of wall, floor, ceiling and similar classes."""
         ...
 
     def label_image(self, index: int) -> NDArray[np.int32]:
-        """(H, W) class ids, pixel by pixel those of the colour image of frame ``index``; 0 where unlabelled.
+        """Return the (H, W) class ids of the pixels of frame ``index``'s colour image; 0 is unlabelled.
 
         Raises:
             RecordingError: The scene has no label images, or this one cannot be used; the message names the file.
@@ -86,7 +86,7 @@ class LabelledDataset(Dataset, Protocol):
         ...
 
     def instance_image(self, index: int) -> NDArray[np.int32] | None:
-        """(H, W) instance ids, 0 where there is none; None if the scene has no such images.
+        """Return (H, W) instance ids, 0 for none; None if the scene has no such images.
 
         Raises:
             RecordingError: The image cannot be used; the message names the file.
@@ -94,7 +94,7 @@ class LabelledDataset(Dataset, Protocol):
         ...
 
     def ground_truth_points(self) -> TruePoints | None:
-        """Labelled points of the surface; None where labels are to be had from the label images.
+        """Return labelled points of the surface; None if the labels are those of the label images.
 
         Raises:
             RecordingError: The file of the surface cannot be used; the message names it.

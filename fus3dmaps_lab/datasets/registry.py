@@ -1,4 +1,4 @@
-"""Datasets by name. A new layout is a new module and a line here."""
+"""The datasets by name. A new layout needs a new module and a line here."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LAYOUTS = {
 
 
 def names() -> list[str]:
-    """Names of the known layouts."""
+    """List the names of the known layouts."""
     return sorted(_LAYOUTS)
 
 
@@ -33,11 +33,11 @@ def open_dataset(name: str, directory: Path, **options: object) -> Dataset:
     Args:
         name: One of :func:`names`.
         directory: The scene's folder, or the one that holds it if ``scene`` is given.
-        options: ``scene``, a folder inside ``directory``; ``stride``, which takes every n-th frame; and those of the layout.
-            Values may be text, as a command line gives them.
+        options: ``scene``, a folder inside ``directory``; ``stride``, which takes every n-th frame; and the options of the
+            layout. Values may be text, as from a command line.
 
     Raises:
-        RecordingError: The layout is unknown, or the folder is not of it; the message names the file.
+        RecordingError: The layout is unknown, or the folder has another layout; the message names the file.
         ConfigError: An option is unknown or of the wrong type.
     """
     if name not in _LAYOUTS:
@@ -54,7 +54,7 @@ def open_labelled(name: str, directory: Path, **options: object) -> LabelledData
     """Open a scene whose true classes are known.
 
     Raises:
-        RecordingError: As :func:`open_dataset`, and where the layout or this folder has no labels.
+        RecordingError: As :func:`open_dataset`; also if the layout or this folder has no labels.
         ConfigError: As :func:`open_dataset`.
     """
     dataset = cast(LabelledDataset, open_dataset(name, directory, **options))

@@ -1,4 +1,4 @@
-"""Classes of a Replica scene, and the labelled surface that the original release holds."""
+"""Classes of a Replica scene, and the labelled surface of its original release."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import read_json
+from fus3dmaps_lab.datasets.checked_files import read_json
 from fus3dmaps_lab.datasets.ply import read_ply
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 from fus3dmaps_lab.datasets.sequence import lookup_table
 
 BACKGROUND = frozenset({"wall", "floor", "ceiling", "door", "window", "background"})
-"""Names of the classes that the published protocol removes where background does not count."""
+"""Names of the classes that the published protocol removes if background does not count."""
 
 
 @dataclass(frozen=True)
 class ReplicaClasses:
-    """What ``info_semantic.json`` of the original release says.
+    """The classes in ``info_semantic.json`` of the original release.
 
     Attributes:
         labels: Classes of the scene, in the order of the release's ids.
         table: (n,) class by the release's class id.
-        class_of_object: Class by the id of an object; empty if the file lists no objects.
+        class_of_object: Class by object id; empty if the file lists no objects.
     """
 
     labels: Labels
@@ -34,12 +34,12 @@ class ReplicaClasses:
 
 
 def read_classes(path: Path) -> ReplicaClasses:
-    """Classes by ``info_semantic.json``: ``classes`` of ``id`` and ``name``, ``objects`` of ``id`` and ``class_id``.
+    """Read ``info_semantic.json``: ``classes`` with ``id`` and ``name``, ``objects`` with ``id`` and ``class_id``.
 
-    The classes that the scene lists are numbered 1, 2, ... in the order of their ids; ids of 0 and less are unlabelled.
+    The classes of the scene are numbered 1, 2, ... in the order of their ids. Ids of 0 and less are unlabelled.
 
     Raises:
-        RecordingError: The file cannot be read or is of another form.
+        RecordingError: The file cannot be read or has another form.
     """
     content = read_json(path)
     try:
@@ -58,13 +58,13 @@ def read_classes(path: Path) -> ReplicaClasses:
 
 
 def read_labelled_mesh(path: Path, classes: ReplicaClasses) -> TruePoints:
-    """The middle of every face of ``mesh_semantic.ply``, whose faces carry ``object_id``.
+    """Read the centre of every face of ``mesh_semantic.ply``, whose faces have an ``object_id``.
 
-    The release's faces are smaller than the voxels that are compared, so that the middles reach every voxel of the surface.
-    Instances are object ids plus one, since ids begin at 0; the unlabelled have none.
+    The faces of the release are smaller than voxels, so the centres reach every voxel of the surface. Instances are object
+    ids plus one, because ids begin at 0; unlabelled faces have no instance.
 
     Raises:
-        RecordingError: The file cannot be read, lacks what is needed, or names an object that the JSON file does not.
+        RecordingError: The file cannot be read, lacks a property, or names an object that is not in the JSON file.
     """
     elements = read_ply(path)
     try:

@@ -1,4 +1,4 @@
-"""Replica as the authors of NICE-SLAM rendered it: 2,000 frames along a smooth path through each of eight rooms."""
+"""Replica as rendered by the authors of NICE-SLAM: 2,000 frames along a smooth path through each of eight rooms."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -18,7 +19,6 @@ from fus3dmaps_lab.datasets.files import (
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 from fus3dmaps_lab.datasets.replica_labels import ReplicaClasses, read_classes, read_labelled_mesh
@@ -30,14 +30,14 @@ _RATE_HZ = 30
 class ReplicaNiceSlam(ImageSequence):
     """One room: ``results/frameNNNNNN.jpg``, ``results/depthNNNNNN.png``, ``traj.txt``; ``cam_params.json`` one level up.
 
-    ``cam_params.json`` holds ``camera: {w, h, fx, fy, cx, cy, scale}``; a depth pixel is metres times ``scale`` (6553.5) in
-    16 bits, 0 without a reading. A line of ``traj.txt`` is a camera-to-world matrix, row by row, metres, of the optical
-    frame (the loader that comes with NICE-SLAM flips y and z of it only because its renderer looks along -z). The world is
-    that of the Replica meshes. Stamps follow from the frame numbers at 30 Hz.
+    ``cam_params.json`` holds ``camera: {w, h, fx, fy, cx, cy, scale}``. A depth pixel is metres times ``scale`` (6553.5) in
+    16 bits, 0 without a reading. A line of ``traj.txt`` is a camera-to-world matrix of the optical frame, row by row, in
+    metres. (NICE-SLAM's own loader flips y and z, because its renderer looks along -z.) The world is that of the Replica
+    meshes. Stamps follow from the frame numbers at 30 Hz.
 
-    The release has no labels. With ``habitat``, the room's folder ``habitat`` of the original Replica release, its
-    ``info_semantic.json`` names the classes and its ``mesh_semantic.ply`` gives the labelled points; without the option both
-    are looked for in the room's own folder ``habitat``.
+    The release has no labels. They come from the original Replica release: ``info_semantic.json`` names the classes and
+    ``mesh_semantic.ply`` gives the labelled points. Both are looked for in the folder of the option ``habitat``, or in the
+    room's own folder ``habitat``.
     """
 
     name = "replica"
@@ -46,12 +46,12 @@ class ReplicaNiceSlam(ImageSequence):
         """List the frames and read camera, path and classes.
 
         Args:
-            directory: Of one room, e.g. ``Replica/office0``.
-            stride: Every n-th frame is taken.
+            directory: Folder of one room, e.g. ``Replica/office0``.
+            stride: Take every n-th frame.
             habitat: Folder of the original release with ``info_semantic.json`` and ``mesh_semantic.ply``.
 
         Raises:
-            RecordingError: A file is missing or odd, or the path has not one pose an image; the message names the file.
+            RecordingError: A file is missing or invalid, or there is not one pose per image; the message names the file.
         """
         require_directory(directory, "a Replica room as NICE-SLAM rendered it")
         results = directory / "results"
@@ -64,7 +64,7 @@ class ReplicaNiceSlam(ImageSequence):
         for line, (number, color) in enumerate(colors.items()):
             depth = require_file(results / f"depth{number:06d}.png")
             T = checked_pose(poses[line], f"'{trajectory}' pose {line + 1}")
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T))
         K, self._units_per_m = _camera(require_file(directory.resolve().parent / "cam_params.json", "the camera"))
         intrinsics = camera_model(K, image_size(frames[0].rgb), directory.resolve().parent / "cam_params.json")
         folder = Path(habitat) if habitat else directory / "habitat"
@@ -77,7 +77,7 @@ class ReplicaNiceSlam(ImageSequence):
         super().__init__(directory.resolve().name, intrinsics, [frames[i] for i in every(len(frames), stride)], labels)
 
     def ground_truth_points(self) -> TruePoints | None:
-        """Middles of the faces of ``mesh_semantic.ply``; None without the original release.
+        """Return the centres of the faces of ``mesh_semantic.ply``; None without the original release.
 
         Raises:
             RecordingError: The mesh cannot be used.
@@ -89,7 +89,7 @@ class ReplicaNiceSlam(ImageSequence):
 
 
 def _camera(path: Path) -> tuple[NDArray[np.float64], float]:
-    """The 3x3 camera matrix, and the value of a depth pixel at one metre."""
+    """Read the 3x3 camera matrix, and the value of a depth pixel at one metre."""
     try:
         fx, fy, cx, cy, scale = (float(read_json(path)["camera"][key]) for key in ("fx", "fy", "cx", "cy", "scale"))
     except (KeyError, TypeError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Replica as the authors of Semantic-NeRF rendered it: two sequences of 900 frames a room, with labels by pixel."""
+"""Replica as rendered by the authors of Semantic-NeRF: two sequences of 900 frames per room, with labels of pixels."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.protocols import Labels
 from fus3dmaps_lab.datasets.replica_labels import read_classes
@@ -29,12 +29,12 @@ _RATE_HZ = 30
 class ReplicaSemanticNerf(ImageSequence):
     """One sequence: ``rgb/rgb_N.png``, ``depth/depth_N.png``, ``semantic_class/semantic_class_N.png``, ``traj_w_c.txt``.
 
-    Depth is 16-bit millimetres along the optical axis. A line of ``traj_w_c.txt`` is a camera-to-world matrix, row by row,
-    metres, of the optical frame. Images are 640x480 (or 320x240 where they were shrunk), of a camera that sees 90 degrees
-    across with its axis through the middle: fx = fy = width / 2, cx = (width - 1) / 2, cy = (height - 1) / 2, as the
-    release's own trainer sets them. ``semantic_instance/semantic_instance_N.png`` may be there. Class ids are Replica's,
-    named by ``info_semantic.json`` of the original release, looked for as ``semantic_info/ROOM/info_semantic.json`` beside
-    the rooms, where the release puts it, and in the room's folder. Stamps follow from the frame numbers at 30 Hz.
+    Depth is 16-bit millimetres along the optical axis. A line of ``traj_w_c.txt`` is a camera-to-world matrix of the optical
+    frame, row by row, metres. Images are 640x480 (or 320x240 if they were shrunk), with a horizontal field of view of 90
+    degrees and a centred axis: fx = fy = width / 2, cx = (width - 1) / 2, cy = (height - 1) / 2, as in the release's own
+    trainer. ``semantic_instance/semantic_instance_N.png`` is optional. Class ids are those of Replica, named by
+    ``info_semantic.json`` of the original release. It is looked for at ``semantic_info/ROOM/info_semantic.json`` beside the
+    rooms, where the release has it, and in the room's folder. Stamps follow from the frame numbers at 30 Hz.
     """
 
     name = "replica_semantic_nerf"
@@ -43,13 +43,13 @@ class ReplicaSemanticNerf(ImageSequence):
         """List the frames and read path and classes.
 
         Args:
-            directory: Of one room, e.g. ``office_0``, or of one of its sequences.
-            stride: Every n-th frame is taken.
+            directory: Folder of one room, e.g. ``office_0``, or of one of its sequences.
+            stride: Take every n-th frame.
             sequence: Folder of the sequence within the room.
-            info: Path of ``info_semantic.json``, where it lies elsewhere.
+            info: Path of ``info_semantic.json``, if it is elsewhere.
 
         Raises:
-            RecordingError: A file is missing or odd, or the path has not one pose an image; the message names the file.
+            RecordingError: A file is missing or invalid, or there is not one pose per image; the message names the file.
         """
         require_directory(directory, "a Replica room as Semantic-NeRF rendered it")
         folder = directory.resolve()
@@ -66,7 +66,7 @@ class ReplicaSemanticNerf(ImageSequence):
         for line, (number, color) in enumerate(colors.items()):
             frames.append(
                 FrameFiles(
-                    stamp_ns(number, _RATE_HZ),
+                    frame_stamp_ns(number, _RATE_HZ),
                     color,
                     require_file(folder / "depth" / f"depth_{number}.png"),
                     checked_pose(poses[line], f"'{trajectory}' pose {line + 1}"),

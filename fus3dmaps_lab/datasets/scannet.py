@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import Intrinsics
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
@@ -20,7 +21,6 @@ from fus3dmaps_lab.datasets.files import (
     read_text,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.ply import read_ply
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
@@ -36,16 +36,16 @@ _TRUTHS = ("auto", "images", "mesh")
 class ScanNet(ImageSequence):
     """One scan: ``color/N.jpg``, ``depth/N.png``, ``pose/N.txt``, ``intrinsic/intrinsic_color.txt`` and ``_depth.txt``.
 
-    So the release's SensReader exports a .sens file. Depth is 16-bit millimetres, 0 without a reading; poses are camera-to-
-    world matrices of the optical frame, metres, all -inf where tracking was lost: those frames are left out and counted in
-    ``lost_poses``. Intrinsics are 4x4 matrices. Colour (1296x968) and depth (640x480) cover one view at two sizes: depth is
-    handed on at its own size, and a scan whose two cameras see different views is refused. Stamps follow from the frame
-    numbers at 30 Hz.
+    This is how the release's SensReader exports a .sens file. Depth is 16-bit millimetres, 0 without a reading. Poses are
+    camera-to-world matrices of the optical frame, metres. They are all -inf while tracking was lost; those frames are left
+    out and counted in ``lost_poses``. Intrinsics are 4x4 matrices. Colour (1296x968) and depth (640x480) show the same view
+    at two sizes. Depth keeps its own size; a scan whose two cameras see different views is refused. Stamps follow from the
+    frame numbers at 30 Hz.
 
     Label images are ``label-filt/N.png``, of the size of the colour images, in the scan's folder or where the release's
-    archive unpacks them (``SCAN_2d-label-filt/label-filt``); instances ``instance-filt/N.png`` likewise. Their ids become
-    NYU40 classes by ``scannetv2-labels.combined.tsv``, looked for in the scan's folder and the two above. Classes
-    are those of NYU40 but for otherprop, otherstructure and otherfurniture, which are unlabelled.
+    archive unpacks them (``SCAN_2d-label-filt/label-filt``); likewise ``instance-filt/N.png`` for instances. The table
+    ``scannetv2-labels.combined.tsv``, looked for in the scan's folder and the two above, turns label ids into NYU40 classes.
+    Of these, otherprop, otherstructure and otherfurniture are unlabelled.
     """
 
     name = "scannet"
@@ -54,14 +54,14 @@ class ScanNet(ImageSequence):
         """List the frames and read camera, poses and classes.
 
         Args:
-            directory: Of one scan, e.g. ``scans/scene0011_00``.
-            stride: Every n-th frame is taken, lost ones counted.
-            labels: Path of ``scannetv2-labels.combined.tsv``, where it lies elsewhere.
-            truth: ``images`` (the published protocol) or ``mesh`` (``SCAN_vh_clean_2.labels.ply``) for the labels; ``auto``
-                takes the images where they are there.
+            directory: Folder of one scan, e.g. ``scans/scene0011_00``.
+            stride: Take every n-th frame, counting lost ones.
+            labels: Path of ``scannetv2-labels.combined.tsv``, if it is elsewhere.
+            truth: Source of the labels: ``images`` (the published protocol) or ``mesh`` (``SCAN_vh_clean_2.labels.ply``);
+                ``auto`` takes the images if they exist.
 
         Raises:
-            RecordingError: A file is missing or odd; the message names it, or says how to export a .sens file.
+            RecordingError: A file is missing or invalid; the message names it, or says how to export a .sens file.
             ConfigError: ``truth`` is something else.
         """
         if truth not in _TRUTHS:
@@ -86,7 +86,7 @@ class ScanNet(ImageSequence):
                 None if folder is None else require_file(folder / f"{number}.png")
                 for folder in (label_images, instance_images)
             )
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), colors[number], depth, T, label, instance))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), colors[number], depth, T, label, instance))
         self._mesh = scan / f"{scan.name}_vh_clean_2.labels.ply"
         if truth == "mesh":
             require_file(self._mesh, "vertices with NYU40 labels")
@@ -99,7 +99,7 @@ class ScanNet(ImageSequence):
         super().__init__(match[1] if match else scan.name, intrinsics, frames, names, lost)
 
     def ground_truth_points(self) -> TruePoints | None:
-        """Labelled vertices of the scan's mesh, without instances; None where the label images are the truth.
+        """Return the labelled vertices of the scan's mesh, without instances; None if the label images are the truth.
 
         Raises:
             RecordingError: The mesh cannot be used.
@@ -146,7 +146,7 @@ def _tsv(scan: Path, given: str) -> Path:
 
 
 def _classes_of(path: Path) -> tuple[NDArray[np.int32], NDArray[np.int32], Labels]:
-    """Class by ScanNet's id, class by NYU40's id, and the classes, numbered in the order of NYU40's ids."""
+    """Return the class by ScanNet id, the class by NYU40 id, and the classes, numbered in the order of NYU40 ids."""
     lines = read_text(path).splitlines()
     columns = lines[0].split("\t") if lines else []
     missing = [column for column in ("id", "nyu40id", "nyu40class") if column not in columns]

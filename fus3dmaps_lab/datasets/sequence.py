@@ -1,4 +1,4 @@
-"""What all datasets share: files of colour, depth and labels in order, each frame with its stamp and pose."""
+"""The base of all datasets: a sequence of frames, each with files of colour, depth and labels, a stamp and a pose."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import ConfigError, FrameError, RecordingError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
-from fus3dmaps_lab.datasets.files import read_ids, read_rgb
+from fus3dmaps_lab.datasets.checked_files import read_ids, read_rgb
 from fus3dmaps_lab.datasets.protocols import Labels, TruePoints
 
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """Where the parts of a frame are.
+    """The files of a frame, with its stamp and pose.
 
     Attributes:
         stamp_ns: Time of the image, nanoseconds.
         rgb: Colour image.
         depth: Depth image.
         T_world_camera: (4, 4) float64 pose of the optical frame in the frame of the dataset's poses.
-        labels: Image of the release's class ids, None without.
-        instances: Image of instance ids, None without.
+        labels: Image of the release's class ids, or None.
+        instances: Image of instance ids, or None.
     """
 
     stamp_ns: int
@@ -38,11 +38,11 @@ class FrameFiles:
 
 
 class ImageSequence(ABC):
-    """A scene as files; a dataset says how to read its depth and what its label values mean.
+    """A scene made of files. Subclasses read depth and translate label values.
 
     Attributes:
         name: Name of the layout.
-        lost_poses: Number of frames left out because the release has no pose for them.
+        lost_poses: Number of frames left out because they have no pose.
     """
 
     name: str
@@ -55,7 +55,7 @@ class ImageSequence(ABC):
         labels: Labels | None = None,
         lost_poses: int = 0,
     ) -> None:
-        """Take over the list of frames.
+        """Store the list of frames.
 
         Raises:
             RecordingError: There are none.
@@ -80,7 +80,7 @@ class ImageSequence(ABC):
 
     @property
     def class_names(self) -> tuple[str, ...]:
-        """Index is the class id; 0 means unlabelled, and its name is empty. Only that one where there are no labels."""
+        """Name by class id; 0 means unlabelled, and its name is empty. Without labels it is the only one."""
         return self._labels.class_names
 
     @property
@@ -89,14 +89,14 @@ class ImageSequence(ABC):
         return self._labels.background
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Count the frames."""
         return len(self._frames)
 
     def __iter__(self) -> Iterator[PosedFrame]:
-        """The frames in order.
+        """Yield the frames in order.
 
         Raises:
-            RecordingError: A file cannot be read or holds something else than it should; the message names the file.
+            RecordingError: A file cannot be read or has the wrong content; the message names the file.
         """
         for files in self._frames:
             rgb, depth_m = self._read_rgb(files.rgb), self._read_depth(files.depth)
@@ -106,7 +106,7 @@ class ImageSequence(ABC):
                 raise RecordingError(f"'{files.rgb}': {error}") from None
 
     def label_image(self, index: int) -> NDArray[np.int32]:
-        """(H, W) class ids of frame ``index``, pixel by pixel those of its colour image; 0 where unlabelled.
+        """Return the (H, W) class ids of the pixels of frame ``index``'s colour image; 0 is unlabelled.
 
         Raises:
             RecordingError: There is no label image, or it cannot be used; the message names the file.
@@ -121,7 +121,7 @@ class ImageSequence(ABC):
             raise RecordingError(f"'{files.labels}' holds the value {raw.max()}, which is no class") from None
 
     def instance_image(self, index: int) -> NDArray[np.int32] | None:
-        """(H, W) instance ids of frame ``index``, 0 where there is none; None if the scene has no such images.
+        """Return the (H, W) instance ids of frame ``index``, 0 for none; None if the scene has no such images.
 
         Raises:
             RecordingError: The image cannot be used; the message names the file.
@@ -130,22 +130,22 @@ class ImageSequence(ABC):
         return None if path is None else self._aligned(path)
 
     def ground_truth_points(self) -> TruePoints | None:
-        """None: this dataset has no labelled surface; those that have one say so."""
+        """Return None: without an override, a dataset has no labelled surface."""
         return None
 
     @abstractmethod
     def _read_depth(self, path: Path) -> NDArray[np.float32]:
-        """(h, w) float32 metres, 0 where there is no reading."""
+        """Read depth as (h, w) float32 metres, 0 where there is no reading."""
 
     def _read_rgb(self, path: Path) -> NDArray[np.uint8]:
         return read_rgb(path)
 
     def _read_ids(self, path: Path) -> NDArray[np.int32]:
-        """(H, W) values of a label image as the release stores them."""
+        """Read the (H, W) values of a label image as the release stores them."""
         return read_ids(path)
 
     def _classes(self, raw: NDArray[np.int32], path: Path) -> NDArray[np.int32]:
-        """(H, W) class ids of the release's values; IndexError for a value that means nothing. Here they are the same."""
+        """Translate the release's values to (H, W) class ids; raise IndexError for an unknown value. Here both are equal."""
         if raw.max(initial=0) >= len(self.class_names):
             raise IndexError
         return raw
@@ -161,7 +161,7 @@ class ImageSequence(ABC):
 
 
 def every(count: int, stride: int) -> range:
-    """Every ``stride``-th of ``count`` places, from the first.
+    """Choose every ``stride``-th of ``count`` places, starting with the first.
 
     Raises:
         ConfigError: The stride is not positive.
@@ -172,7 +172,7 @@ def every(count: int, stride: int) -> range:
 
 
 def lookup_table(class_of_value: dict[int, int]) -> NDArray[np.int32]:
-    """(n,) class id by value, -1 for values that mean nothing and lie between others; 0 stays 0."""
+    """Make a table, (n,), of class ids by value; -1 for unknown values in between, 0 stays 0."""
     table = np.full(max(class_of_value, default=0) + 1, -1, np.int32)
     for value, class_id in class_of_value.items():
         table[value] = class_id
@@ -181,7 +181,7 @@ def lookup_table(class_of_value: dict[int, int]) -> NDArray[np.int32]:
 
 
 def look_up(table: NDArray[np.int32], raw: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Classes of values by :func:`lookup_table`; IndexError for a value that means nothing."""
+    """Look up the classes of values in a :func:`lookup_table`; raise IndexError for an unknown value."""
     classes = table[raw]
     if classes.min(initial=0) < 0:
         raise IndexError

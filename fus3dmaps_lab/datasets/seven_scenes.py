@@ -1,4 +1,4 @@
-"""7-Scenes: Kinect recordings of seven rooms by Microsoft Research (Shotton et al. 2013), or any in their layout."""
+"""7-Scenes: Kinect recordings of seven rooms by Microsoft Research (Shotton et al. 2013), or others in their layout."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
     checked_pose,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_depth,
     read_matrix,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.sequence import FrameFiles, ImageSequence, every
 
@@ -29,9 +29,9 @@ _NOMINAL_K = np.array([[585.0, 0.0, 320.0], [0.0, 585.0, 240.0], [0.0, 0.0, 1.0]
 class SevenScenes(ImageSequence):
     """One sequence: ``frame-NNNNNN.color.png`` (or .jpg), ``.depth.png`` (16-bit millimetres), ``.pose.txt``.
 
-    Poses are camera-to-world matrices of the optical frame, metres. Depth of 0 and 65535 is no reading. Intrinsics come from
-    ``camera-intrinsics.txt`` (3x3) if it is there, else they are the dataset's nominal ones (585, 585, 320, 240). Stamps
-    follow from the frame numbers at 30 Hz. All of this is as the dataset's page states it, but for the intrinsics file.
+    Poses are camera-to-world matrices of the optical frame, metres. Depth of 0 and 65535 is no reading. Intrinsics are read
+    from ``camera-intrinsics.txt`` (3x3) if it exists; otherwise the dataset's nominal ones are used (585, 585, 320, 240).
+    Stamps follow from the frame numbers at 30 Hz. The dataset's page states all of this except the intrinsics file.
     """
 
     name = "sevenscenes"
@@ -40,8 +40,8 @@ class SevenScenes(ImageSequence):
         """List the sequence and read its poses.
 
         Args:
-            directory: Of one sequence, e.g. ``seq-01``.
-            stride: Every n-th frame is taken.
+            directory: Folder of one sequence, e.g. ``seq-01``.
+            stride: Take every n-th frame.
 
         Raises:
             RecordingError: The directory is missing or holds no frames, a frame lacks its depth or pose file, a pose is not
@@ -57,7 +57,7 @@ class SevenScenes(ImageSequence):
             stem = directory / f"frame-{number:06d}"
             depth, pose = (require_file(stem.with_name(stem.name + end)) for end in (".depth.png", ".pose.txt"))
             T = checked_pose(read_matrix(pose, 4), f"'{pose}'")
-            frames.append(FrameFiles(stamp_ns(number, _RATE_HZ), color, depth, T))
+            frames.append(FrameFiles(frame_stamp_ns(number, _RATE_HZ), color, depth, T))
         intrinsics_file = directory / "camera-intrinsics.txt"
         K = read_matrix(intrinsics_file, 3) if intrinsics_file.exists() else _NOMINAL_K
         intrinsics = camera_model(K, image_size(frames[0].rgb), intrinsics_file)

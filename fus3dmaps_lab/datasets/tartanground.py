@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     camera_model,
+    frame_stamp_ns,
     image_size,
     numbered_files,
     read_json,
@@ -17,28 +18,27 @@ from fus3dmaps_lab.datasets.files import (
     read_rows,
     require_directory,
     require_file,
-    stamp_ns,
 )
 from fus3dmaps_lab.datasets.poses import FROM_FORWARD_RIGHT_DOWN, pose_of_quaternion
 from fus3dmaps_lab.datasets.protocols import Labels
 from fus3dmaps_lab.datasets.sequence import FrameFiles, ImageSequence, every, look_up, lookup_table
 
 _RATE_HZ = 10
-_FAR_M = 1000.0  # The sky is a sphere around the scene, some 10 km off; nothing that is mapped is so far.
+_FAR_M = 1000.0  # The sky is a sphere around the scene, about 10 km away; nothing else is so far.
 _BACKGROUND = frozenset({"wall", "floor", "ceiling", "door", "window", "background", "ground", "sky"})
 
 
 class TartanGround(ImageSequence):
     """One trajectory: ``image_lcam_front``, ``depth_lcam_front``, ``seg_lcam_front`` and ``pose_lcam_front.txt``.
 
-    Files are ``NNNNNN_lcam_front.png``, ``NNNNNN_lcam_front_depth.png`` and ``NNNNNN_lcam_front_seg.png``. The documentation
-    of the release states: 10 Hz; 90 degrees across 640x640 pixels with focal length and principal point 320; depth is a
-    float32 of metres whose four bytes are the channels of the PNG. A line of the pose file is
-    ``tx ty tz qx qy qz qw`` in a NED world, of a camera frame with x forward, y right and z down; the frames that are handed
-    on have the optical frame's axes, while the world stays NED (z points down). The sky is no reading.
+    Files are ``NNNNNN_lcam_front.png``, ``NNNNNN_lcam_front_depth.png`` and ``NNNNNN_lcam_front_seg.png``. The release
+    documents: 10 Hz; 640x640 pixels with a field of view of 90 degrees, focal length and principal point 320; depth is a
+    float32 in metres whose four bytes are the channels of the PNG. A line of the pose file is ``tx ty tz qx qy qz qw`` in a
+    NED world, for a camera frame with x forward, y right and z down. Poses are turned into the optical frame, while the
+    world stays NED (z points down). The sky is no reading.
 
-    ``seg_label_map.json`` of the environment, in the trajectory's folder or one or two above, maps names to values of the
-    8-bit label images under ``name_map``. Names of several values are one class. Classes are in the order of their names;
+    ``seg_label_map.json`` of the environment, in the trajectory's folder or one or two above, has a ``name_map`` from names
+    to values of the 8-bit label images. A name with several values is one class. Classes are in the order of their names;
     other values are unlabelled.
     """
 
@@ -48,11 +48,11 @@ class TartanGround(ImageSequence):
         """List the frames and read poses and classes.
 
         Args:
-            directory: Of one trajectory, e.g. ``AbandonedFactory/Data_omni/P0000``.
-            stride: Every n-th frame is taken.
+            directory: Folder of one trajectory, e.g. ``AbandonedFactory/Data_omni/P0000``.
+            stride: Take every n-th frame.
 
         Raises:
-            RecordingError: A file is missing or odd, or there is not one pose an image; the message names the file.
+            RecordingError: A file is missing or invalid, or there is not one pose per image; the message names the file.
         """
         require_directory(directory, "a TartanGround trajectory")
         folder = directory.resolve()
@@ -73,7 +73,7 @@ class TartanGround(ImageSequence):
             T_ned_optical = pose_of_quaternion(rows[line], f"'{pose_file}' pose {line + 1}") @ FROM_FORWARD_RIGHT_DOWN
             frames.append(
                 FrameFiles(
-                    stamp_ns(number, _RATE_HZ),
+                    frame_stamp_ns(number, _RATE_HZ),
                     color,
                     require_file(folder / "depth_lcam_front" / f"{stem}_depth.png"),
                     T_ned_optical,
@@ -101,7 +101,7 @@ class TartanGround(ImageSequence):
 
 
 def _classes_of(path: Path) -> tuple[NDArray[np.int32], Labels]:
-    """(256,) class by value, and the classes."""
+    """Return the class by value, (256,), and the classes."""
     content = read_json(path)
     try:
         values = {

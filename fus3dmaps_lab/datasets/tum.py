@@ -12,7 +12,7 @@ from fus3dmaps_core.errors import ConfigError, RecordingError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.distortion import Distortion, Rectifier
 from fus3dmaps_core.geometry.trajectory import PoseBuffer, PoseGap
-from fus3dmaps_lab.datasets.files import (
+from fus3dmaps_lab.datasets.checked_files import (
     image_size,
     read_depth,
     read_rgb,
@@ -25,7 +25,7 @@ from fus3dmaps_lab.datasets.poses import pose_of_quaternion
 from fus3dmaps_lab.datasets.sequence import FrameFiles, ImageSequence, every
 
 _DEPTH_UNITS_PER_M = 5000
-_PAIR_WITHIN_NS = 20_000_000  # As the benchmark's own associate.py has it.
+_PAIR_WITHIN_NS = 20_000_000  # As in the benchmark's own associate.py.
 _POSE_GAP_S = 0.1  # Motion capture runs at 100 Hz; a longer gap means that the markers were out of sight.
 # fx, fy, cx, cy and k1, k2, p1, p2, k3 of the three cameras, as the benchmark's page lists them. Camera 3 is rectified.
 _CAMERAS = {
@@ -38,11 +38,11 @@ _CAMERAS = {
 class TumRgbd(ImageSequence):
     """One sequence: ``rgb.txt`` and ``depth.txt`` (stamp and file a line), ``groundtruth.txt``, and the images they name.
 
-    Depth is 16 bits, 5000 a metre, 0 without a reading, and registered to the colour image already. A line of
-    ``groundtruth.txt`` is ``stamp tx ty tz qx qy qz qw``: pose of the colour camera's optical frame in the world of the
-    motion capture system, seconds and metres. A colour image takes the depth image nearest in time, within 20 ms, and the
-    pose interpolated at its stamp; one without is left out, and counted in ``unpaired`` or ``lost_poses``. Lens distortion
-    is undone in both images. The camera is the one of the sequence's name (freiburg1, 2 or 3), or of the option ``camera``.
+    Depth has 16 bits, 5000 per metre, 0 without a reading, and is already registered to the colour image. A line of
+    ``groundtruth.txt`` is ``stamp tx ty tz qx qy qz qw``: the pose of the colour camera's optical frame in the world of the
+    motion capture system, seconds and metres. A colour image gets the depth image nearest in time, within 20 ms, and the
+    pose interpolated at its stamp. Without one it is left out and counted in ``unpaired`` or ``lost_poses``. Lens distortion
+    is removed from both images. The camera follows from the sequence's name (freiburg1, 2 or 3) or the option ``camera``.
     """
 
     name = "tum"
@@ -51,12 +51,12 @@ class TumRgbd(ImageSequence):
         """Read the lists, pair the images and find their poses.
 
         Args:
-            directory: Of one sequence, e.g. ``rgbd_dataset_freiburg1_desk``.
-            stride: Every n-th of the colour images is taken.
-            camera: ``1``, ``2`` or ``3``, where the folder's name does not say.
+            directory: Folder of one sequence, e.g. ``rgbd_dataset_freiburg1_desk``.
+            stride: Take every n-th colour image.
+            camera: ``1``, ``2`` or ``3``, if the folder's name does not say.
 
         Raises:
-            RecordingError: A file is missing or odd, or the camera is unknown; the message names the file.
+            RecordingError: A file is missing or invalid, or the camera is unknown; the message names the file.
             ConfigError: ``camera`` is something else.
         """
         require_directory(directory, "a TUM RGB-D sequence")
@@ -104,7 +104,7 @@ class TumRgbd(ImageSequence):
 
 
 def _stamp_ns(text: str, where: str) -> int:
-    # Not by float: seconds since 1970 have no room for nanoseconds in one.
+    # Not by float, which is too short for seconds since 1970 with nanoseconds.
     match = re.fullmatch(r"(\d+)(?:\.(\d{1,9})\d*)?", text)
     if match is None:
         raise RecordingError(f"{where} has no stamp in seconds: {text[:30]!r}")
@@ -112,13 +112,13 @@ def _stamp_ns(text: str, where: str) -> int:
 
 
 def _lines(path: Path) -> list[tuple[str, list[str]]]:
-    """Where each line is, and its words; comments and empty lines left out."""
+    """Split lines into words, each with its place in the file; leave out comments and empty lines."""
     lines = enumerate(read_text(require_file(path)).splitlines(), start=1)
     return [(f"'{path}' line {n}", line.split()) for n, line in lines if line.strip() and not line.startswith("#")]
 
 
 def _list(path: Path) -> list[tuple[int, Path]]:
-    """Stamps and files of ``rgb.txt`` or ``depth.txt``, by stamp."""
+    """Read stamps and files from ``rgb.txt`` or ``depth.txt``, in order of stamps."""
     found = []
     for where, words in _lines(path):
         if len(words) != 2:

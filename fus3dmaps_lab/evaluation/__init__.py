@@ -1,1 +1,1 @@
-"""How good a map is: protocol, metrics, experiments and their report."""
+"""Evaluation of maps: protocol, metrics, experiments and their report."""

@@ -1,7 +1,7 @@
-"""Our numbers and the paper's in one table, each row saying whose it is and what it was measured on.
+"""Tables with our numbers beside the paper's. Each row says whose it is and what it was measured on.
 
-A simulation shares no scene, sensor or model with the paper. Only the paper's effects (a difference, a share kept) stand
-beside those of a simulation; its scores stand beside ours for its own datasets alone.
+A simulation has no scene, sensor or model in common with the paper. So only effects (a difference, a share kept) are
+compared with those of the paper; scores are compared only on the paper's own datasets.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _Key = tuple[str, str, str, str, str]
 
 
 def effect_table(records: Sequence[Record], effect: Effect, encoders: str) -> Table:
-    """What one change does here and in the paper: the difference, and the share of the first value that is kept.
+    """Make the table of one effect here and in the paper: the difference, and the share of the first value that is kept.
 
-    Both values are shown as well, unless the records are of a simulation.
+    Both values are shown as well, except for a simulation.
 
     Args:
-        records: Of one group (see ``effects.group_of``).
-        effect: Which change.
-        encoders: What made the embeddings of the records.
+        records: Records of one group (see ``effects.group_of``).
+        effect: The effect.
+        encoders: Name of the encoders of the records.
     """
     metrics: tuple[str, ...] = PAPER_METRICS
     if effect == FUSED_DENSE:
@@ -72,7 +72,7 @@ def effect_table(records: Sequence[Record], effect: Effect, encoders: str) -> Ta
 
 
 def paper_effect(effect: Effect) -> dict[tuple[str, str, str], tuple[float, float]]:
-    """The paper's values under both conditions of an effect, by dataset, method and metric as our records name it."""
+    """Return the paper's values under both conditions of an effect, by dataset, method and our name of the metric."""
     values = {_key(row): row.value for row in PAPER_ROWS if row.method in (NARADIO, CLIP_DINOISER) and row.table != "lambda"}
     found = {}
     for (dataset, method, layer, mode, metric), first in values.items():
@@ -84,12 +84,12 @@ def paper_effect(effect: Effect) -> dict[tuple[str, str, str], tuple[float, floa
 
 
 def results_table(records: Sequence[Record], dataset: str, encoders: str) -> Table:
-    """Scores on one of the paper's datasets: ours, averaged over the scenes that were run, and every method of the paper.
+    """Make the table of scores on one of the paper's datasets: ours, averaged over the scenes run, and all of the paper.
 
     Args:
-        records: Of that dataset.
+        records: Records of that dataset.
         dataset: Its name in the paper's tables.
-        encoders: What made the embeddings of the records.
+        encoders: Name of the encoders of the records.
     """
     metrics = (*PAPER_METRICS, *(metric + WITH_BACKGROUND for metric in PAPER_METRICS))
     source, data = _whose(records)
@@ -108,11 +108,11 @@ def results_table(records: Sequence[Record], dataset: str, encoders: str) -> Tab
 
 
 def lambda_table(points: Sequence[CurvePoint], metric: str = "mIoU") -> Table:
-    """How flat the optimum of lambda is, here and in the paper: each value as a share of the best one of its row, percent.
+    """Make the table that shows how flat the optimum of lambda is: each value in percent of the best one of its row.
 
     Args:
-        points: Of the experiment ``lambda``.
-        metric: Which of its metrics.
+        points: Points of the experiment ``lambda``.
+        metric: One of its metrics.
     """
     sweeps: dict[tuple[str, str], dict[float, list[float]]] = {}
     for point in points:
@@ -134,10 +134,10 @@ def lambda_table(points: Sequence[CurvePoint], metric: str = "mIoU") -> Table:
 
 
 def memory_table(points: Sequence[CurvePoint]) -> Table:
-    """What the sliding window takes of the dense map's memory: here at the largest volume of a seed, in the paper by scene.
+    """Make the table of the window's share of the dense map's memory: ours at a seed's largest volume, the paper's by scene.
 
     Args:
-        points: Of the experiment ``memory``; curves other than ``dense map`` and ``sliding window`` are left out.
+        points: Points of the experiment ``memory``; curves other than ``dense map`` and ``sliding window`` are left out.
     """
     rows: list[tuple[Cell, ...]] = [
         ("ours, simulation", f"seed {seed}, {volume_m3:,.0f} m³", "simulated", 100 * window / dense if dense else math.nan)
@@ -153,12 +153,12 @@ def memory_table(points: Sequence[CurvePoint]) -> Table:
 
 
 def _key(row: PaperRow) -> _Key:
-    """Dataset, method, layer, mode and our name of the metric."""
+    """Return dataset, method, layer, mode and our name of the metric."""
     return row.dataset, row.method, row.layer, row.mode, row.metric + (WITH_BACKGROUND if row.background else "")
 
 
 def _whose(records: Sequence[Record]) -> tuple[str, str]:
-    """Source and data of our own rows, so named that none passes for the paper's."""
+    """Return source and data of our own rows, named so that they cannot be mistaken for the paper's."""
     group = group_of(records[0].scene)
     scenes = sorted({record.scene for record in records})
     seeds = len({(record.scene, record.seed) for record in records})

@@ -1,4 +1,4 @@
-"""Mapping one simulated building in several ways at once: each frame is rendered, segmented and embedded once."""
+"""Mapping of one simulated building in several ways at once; each frame is rendered, segmented and embedded once."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class Variant:
 
     Attributes:
         settings: Parameters that differ from the defaults, by dotted key.
-        statistics: Of the simulated encoders; variants with equal ones see equal embeddings.
+        statistics: Statistics of the simulated encoders; variants with equal statistics get equal embeddings.
     """
 
     settings: Mapping[str, Any] = field(default_factory=dict)
@@ -31,10 +31,10 @@ class Variant:
 
 
 class BuildingRun:
-    """Several maps of one building, fed with the same frames.
+    """Several maps of one building from the same frames.
 
     Attributes:
-        pipelines: By the name of their variant.
+        pipelines: Pipelines by the name of their variant.
     """
 
     def __init__(
@@ -48,11 +48,11 @@ class BuildingRun:
         """Make the encoders and empty maps.
 
         Args:
-            truth: Of the building.
+            truth: Ground truth of the building.
             image_size: Width and height of its images, pixels.
-            variants: What to map, by name.
-            seed: Of everything that the simulated models draw.
-            segmenter_statistics: Of the simulated segmenter; its defaults without.
+            variants: The variants, by name.
+            seed: Seed of the simulated models.
+            segmenter_statistics: Statistics of the simulated segmenter; None takes the defaults.
         """
         width, height = image_size
         self._oracle = Oracle()
@@ -68,10 +68,10 @@ class BuildingRun:
             self.pipelines[name] = Pipeline(Config.from_flat(settings), trios[seeded], segmenter)
 
     def feed(self, frames: Iterable[LabelledFrame], on_frame: Callable[[int], object] | None = None) -> None:
-        """Map frames in every way, and fuse at their end.
+        """Map frames with every variant, and fuse at the end.
 
         Args:
-            frames: In order of time.
+            frames: Frames in order of time.
             on_frame: Called with the number of frames done.
         """
         for done, labelled in enumerate(frames, start=1):

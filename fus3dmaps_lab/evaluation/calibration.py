@@ -1,4 +1,4 @@
-"""Whether a map is as often right as it says: reliability curve and expected calibration error (Guo et al. 2017)."""
+"""Calibration of a map's probabilities: reliability curve and expected calibration error (Guo et al. 2017)."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from fus3dmaps_core.errors import MapError
 
 @dataclass(frozen=True)
 class Reliability:
-    """How often predictions of about the same probability are right.
+    """A reliability curve: the share of right predictions in bins of probability.
 
     Attributes:
-        edges: (b + 1,) float64 of the bins, from 0 to 1; a bin holds its upper edge, the first one both.
+        edges: (b + 1,) float64 edges of the bins, from 0 to 1. A bin includes its upper edge, the first one both edges.
         counts: (b,) int64 predictions in each bin.
-        confidence: (b,) float64 mean probability in each bin, NaN where it is empty.
-        accuracy: (b,) float64 share of them that are right, NaN where it is empty.
+        confidence: (b,) float64 mean probability in each bin, NaN if it is empty.
+        accuracy: (b,) float64 share of right predictions in each bin, NaN if it is empty.
     """
 
     edges: NDArray[np.float64]
@@ -37,12 +37,12 @@ class Reliability:
 
 
 def reliability(probabilities: NDArray[np.floating], right: NDArray[np.bool_], bins: int = 15) -> Reliability:
-    """Reliability curve of predictions.
+    """Compute the reliability curve of predictions.
 
     Args:
-        probabilities: (n,) in [0, 1], of the class that was predicted.
-        right: (n,) whether that is the true one.
-        bins: Bins of equal width.
+        probabilities: (n,) probabilities of the predicted classes, in [0, 1].
+        right: (n,) whether the predicted class is the true one.
+        bins: Number of bins, of equal width.
 
     Raises:
         MapError: The arrays differ in length, or a probability is outside of [0, 1].

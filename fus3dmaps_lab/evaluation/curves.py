@@ -1,4 +1,4 @@
-"""What is read off the curves of the experiments: where a sweep is best, how a line rises, where it ends."""
+"""Figures read off the curves of experiments: the optimum of a sweep, the slope of a line, its last values."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ DENSE_MAP, SLIDING_WINDOW, PREDICTED = "dense map", "sliding window", "predicted
 """Curves of the memory experiment."""
 
 UNFUSED = ", unfused"
-"""What the name of an option ends in where its unfused instances are evaluated."""
+"""Ending of an option's name if its unfused instances are evaluated."""
 
 
 @dataclass(frozen=True)
 class LambdaOptimum:
-    """Where one curve of the lambda sweep is best.
+    """The optimum of one curve of the lambda sweep.
 
     Attributes:
         ratio: R^D / R^I, the lambda that theory predicts.
-        best: Lambda of the greatest mean.
-        low: Next lambda below the best one, or the best itself at the end of the sweep.
-        high: Next lambda above it, likewise.
+        best: Lambda with the greatest mean.
+        low: Next lambda below the best one, or the best one itself at the end of the sweep.
+        high: Next lambda above the best one, likewise.
         brackets: Whether ratio is within [low, high].
-        loss_percent: What the evaluated lambda nearest to ratio loses against the best one.
-        seeds: In how many seeds that curve's own best brackets the ratio, and of how many.
+        loss_percent: Loss of the evaluated lambda nearest to ratio against the best one.
+        seeds: Number of seeds whose own optimum brackets the ratio, and number of all seeds.
     """
 
     ratio: float
@@ -50,10 +50,10 @@ class Line:
 
     Attributes:
         slope: Bytes per m^3.
-        offset: Bytes at no volume.
+        offset: Bytes at volume 0.
         linearity: Coefficient of determination, R^2.
-        largest_x: Volume of its farthest point, m^3.
-        volumes: How many different volumes it goes through.
+        largest_x: Largest volume of its points, m^3.
+        volumes: Number of different volumes.
     """
 
     slope: float
@@ -64,24 +64,24 @@ class Line:
 
 
 def metric_words(metric: str) -> str:
-    """A metric of the lambda sweep with the layer that it is of: fused instances, unless it is named ``LAYER/METRIC``."""
+    """Name a metric of the lambda sweep with its layer: fused instances, unless it is named ``LAYER/METRIC``."""
     layer, _, name = metric.rpartition("/")
     return f"{name} of {'fused instances' if not layer else 'the ' + layer.replace('_', ' ') + ' layer'}"
 
 
 def option_of(curve: str) -> tuple[str, bool]:
-    """What a curve of the experiment ``association`` is named after: the option, and whether its instances are fused."""
+    """Split the name of a curve of the experiment ``association``: the option, and whether its instances are fused."""
     return curve.removesuffix(UNFUSED), not curve.endswith(UNFUSED)
 
 
 def predicted_ratio(curve: str) -> float | None:
-    """R^D / R^I that a curve of the lambda sweep is named after; None for another name."""
+    """Read R^D / R^I from the name of a curve of the lambda sweep; None for other names."""
     named = RATIO.fullmatch(curve)
     return float(named[1]) if named and float(named[1]) > 0 else None
 
 
 def lambda_optima(points: Sequence[CurvePoint], metric: str = "mIoU") -> list[LambdaOptimum]:
-    """The best lambda of every curve that is named after its noise ratio, in the order of the ratios."""
+    """Find the optimum of every curve that is named after its noise ratio, in the order of the ratios."""
     optima = []
     for curve in dict.fromkeys(point.curve for point in points):
         ratio = predicted_ratio(curve)
@@ -107,7 +107,7 @@ def lambda_optima(points: Sequence[CurvePoint], metric: str = "mIoU") -> list[La
 
 
 def line_of(points: Sequence[CurvePoint], curve: str) -> Line | None:
-    """The line through one curve's bytes over all seeds; None with fewer than two different volumes."""
+    """Fit a line through one curve's bytes over all seeds; None with fewer than two different volumes."""
     xy = np.array([(p.x, p.value) for p in points if (p.curve, p.metric) == (curve, "bytes")], np.float64).reshape(-1, 2)
     x, y = xy[:, 0], xy[:, 1]
     if len(np.unique(x)) < 2:
@@ -119,9 +119,9 @@ def line_of(points: Sequence[CurvePoint], curve: str) -> Line | None:
 
 
 def bytes_at_the_end(points: Sequence[CurvePoint]) -> dict[int, tuple[float, float, float]]:
-    """Largest mapped volume (m^3), bytes of the dense map there and of the sliding window at its own end, by seed.
+    """Return by seed: the largest mapped volume (m^3), the dense map's bytes there, the sliding window's at its own end.
 
-    Seeds that lack either curve are left out.
+    Seeds without one of the two curves are left out.
     """
     ends: dict[int, tuple[float, float, float]] = {}
     for seed in sorted({point.seed for point in points}):
@@ -135,7 +135,7 @@ def bytes_at_the_end(points: Sequence[CurvePoint]) -> dict[int, tuple[float, flo
 
 
 def _best_of(values: dict[float, float]) -> tuple[float, float, float]:
-    """Where values are greatest, and the neighbours on the grid (itself at an end)."""
+    """Find the x of the greatest value and its neighbours on the grid (itself at an end)."""
     grid = sorted(values)
     at = max(range(len(grid)), key=lambda i: values[grid[i]])
     return grid[at], grid[max(at - 1, 0)], grid[min(at + 1, len(grid) - 1)]

@@ -1,4 +1,4 @@
-"""A scene of a published dataset, mapped in every mode and compared with its labels."""
+"""Mapping of a published dataset's scene in every mode, and comparison with its labels."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from fus3dmaps_lab.evaluation.records import LAYERS, MODES, Record
 from fus3dmaps_lab.evaluation.shared_models import shared_segmenter, shared_trio
 
 PUBLISHED_WINDOW_M = 6.0
-"""Radius of the sliding window where the configuration has none."""
+"""Radius of the sliding window if the configuration has none."""
 
 
 def evaluate_dataset(
     dataset: LabelledDataset, config: Config, on_progress: Callable[[int, int], object] | None = None
 ) -> list[Record]:
-    """Map a scene in every mode, with one pass of the segmenter and of each encoder a mode, and evaluate the maps.
+    """Map a scene in every mode, with one pass of the segmenter and of each encoder for all modes, and evaluate the maps.
 
     Args:
         dataset: The scene.
-        config: For mapping; ``fusion.window_radius_m`` is that of the modes with a window, 6 m if it is 0.
-        on_progress: Called with the number of frames mapped, and of all.
+        config: Configuration of the mapping. ``fusion.window_radius_m`` is used in the modes with a window; 0 becomes 6 m.
+        on_progress: Called with the number of frames mapped and of all frames.
 
     Raises:
         RecordingError: The scene has no frame, or no voxel with a label.
@@ -83,13 +83,13 @@ def evaluate_dataset(
 
 
 def _at_working_resolution(frame: PosedFrame, config: Config) -> PosedFrame:
-    """Resized once, so that the pipelines hand on the same image."""
+    """Resize a frame once, so that all pipelines pass on the same image."""
     working = resize_frame(frame, config.image)
     return PosedFrame(frame.stamp_ns, working.rgb, working.depth_m, working.intrinsics, frame.T_world_camera)
 
 
 def _truths(dataset: LabelledDataset, config: Config) -> tuple[VoxelTruth, VoxelTruth | None]:
-    """Truth of all classes, and of the others than background where a voxel's class depends on which are kept."""
+    """Return the truth of all classes, and that without background if a voxel's class depends on the classes kept."""
     size_m = config.map.voxel_size_m
     points = dataset.ground_truth_points()
     if points is not None:

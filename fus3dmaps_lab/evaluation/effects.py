@@ -1,4 +1,4 @@
-"""What the paper claims, as pairs of conditions to compare, and the records that belong to each."""
+"""The paper's claims as pairs of conditions to compare, and the records that belong to each."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from fus3dmaps_lab.evaluation.records import Record
 from fus3dmaps_lab.evaluation.statistics import ComparisonError, PairedComparison, Unit, compare, named
 
 SIMULATION = "simulation"
-"""Group of all simulated scenes; the word stands wherever their numbers do."""
+"""Group of all simulated scenes; the word appears wherever their numbers do."""
 
 OTHER = "other recordings"
 """Group of recorded scenes that the paper does not use."""
@@ -20,13 +20,13 @@ SCORES = ("mIoU", "f-mIoU", "accuracy", "mean_accuracy")
 """Metrics of semantic segmentation, without background classes."""
 
 WITH_BACKGROUND = "_with_background"
-"""What their names end in where background classes count."""
+"""Ending of their names if background classes count."""
 
 HEADLINE_METRICS = (*SCORES, *(metric + WITH_BACKGROUND for metric in SCORES))
 """Metrics that every table shows first, in this order."""
 
 CLASS_PREFIX = "iou/"
-"""What precedes a class in the metric that is its IoU."""
+"""Prefix of the metrics that are the IoU of a class."""
 
 _CLASS_PREFIXES = (CLASS_PREFIX, f"iou{WITH_BACKGROUND}/")
 
@@ -39,7 +39,7 @@ _SCENE_PATTERNS = {
 
 @dataclass(frozen=True)
 class Condition:
-    """A layer in a mode.
+    """A layer in a mode of mapping.
 
     Attributes:
         layer: One of LAYERS.
@@ -58,8 +58,8 @@ class Effect:
     """A change whose effect is measured.
 
     Attributes:
-        name: Short, for file names.
-        title: What is compared, in words.
+        name: Short name, for file names.
+        title: The comparison in words.
         first: Condition without the change.
         second: Condition with it.
     """
@@ -93,12 +93,12 @@ EFFECTS = (FUSED_INSTANCES, FUSED_DENSE, WINDOW, NO_EVIDENCE)
 
 
 def is_simulated(scene: str) -> bool:
-    """Whether a scene is a simulation: it says so in its name."""
+    """Return whether a scene is a simulation, by its name."""
     return "simulat" in scene.lower()
 
 
 def paper_scene(scene: str) -> tuple[str, str] | None:
-    """Dataset and scene of the paper that a recorded scene is, by its name in any of the published layouts."""
+    """Return the paper's dataset and scene of a recorded scene, by its name in any of the published layouts."""
     for dataset, pattern in _SCENE_PATTERNS.items():
         found = re.fullmatch(pattern, scene.lower())
         if found and (name := "".join(found.groups())) in SCENES[dataset]:
@@ -107,7 +107,7 @@ def paper_scene(scene: str) -> tuple[str, str] | None:
 
 
 def group_of(scene: str) -> str:
-    """``simulation``, the paper's dataset that the scene belongs to, or ``other recordings``."""
+    """Return a scene's group: ``simulation``, its dataset in the paper, or ``other recordings``."""
     if is_simulated(scene):
         return SIMULATION
     found = paper_scene(scene)
@@ -115,7 +115,7 @@ def group_of(scene: str) -> str:
 
 
 def grouped(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Records by group, simulations first, then the paper's datasets, then other recordings; empty groups left out."""
+    """Group the records: simulations first, then the paper's datasets, then other recordings; no empty groups."""
     groups: dict[str, list[Record]] = {name: [] for name in (SIMULATION, *SCENES, OTHER)}
     for record in records:
         groups[group_of(record.scene)].append(record)
@@ -123,13 +123,13 @@ def grouped(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def metrics_in(records: Iterable[Record]) -> tuple[str, ...]:
-    """Metrics that occur, those of HEADLINE_METRICS first, the rest by name, IoUs of classes left out."""
+    """List the metrics of the records, HEADLINE_METRICS first, the others by name, without IoUs of classes."""
     present = {record.metric for record in records if not record.metric.startswith(_CLASS_PREFIXES)}
     return (*(metric for metric in HEADLINE_METRICS if metric in present), *sorted(present - set(HEADLINE_METRICS)))
 
 
 def values_of(records: Iterable[Record], condition: Condition, metric: str) -> dict[Unit, float]:
-    """Value of a metric by scene and seed under one condition; empty where it was not measured.
+    """Return the values of a metric under one condition, by scene and seed; empty if it was not measured.
 
     Raises:
         ComparisonError: A scene and seed has two values.
@@ -146,7 +146,7 @@ def values_of(records: Iterable[Record], condition: Condition, metric: str) -> d
 
 
 def compare_effect(records: Sequence[Record], effect: Effect, metric: str) -> PairedComparison | None:
-    """The two conditions of an effect, paired by scene and seed; None where either was not measured at all.
+    """Compare the two conditions of an effect, paired by scene and seed; None if one of them was not measured at all.
 
     Raises:
         ComparisonError: They were measured on different scenes or seeds, or a value is missing or given twice.

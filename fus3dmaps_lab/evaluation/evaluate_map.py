@@ -1,15 +1,15 @@
-"""All metrics of a map against the truth, layer by layer.
+"""Evaluation of a map against the truth: all metrics of all layers.
 
-Metrics of a layer; classes are all but background ones, and ``_with_background`` has them all:
+Metrics of a layer, without background classes unless ``_with_background`` is in the name:
 
 - ``mIoU``, ``f-mIoU``, ``accuracy``, ``mean_accuracy``, ``iou/NAME`` (``iou_with_background/NAME``) of each class;
-- ``coverage``, share of the truth's voxels that have a voxel of the layer near them, and ``mIoU_covered``, the mIoU over
-  these alone: what to look at where a layer does not cover the truth, as the dense layer of a map with a window;
+- ``coverage``, the share of the truth's voxels with a voxel of the layer near them, and ``mIoU_covered``, the mIoU over
+  these alone, for layers that do not cover the truth, such as the dense layer of a map with a window;
 - ``ECE``, expected calibration error of the likeliest class of the nearest voxel;
-- ``cosine``, mean cosine of a voxel's embedding with the text of its true class, at the nearest voxel: how near embeddings
-  are to what they should be, whatever else they are compared with;
+- ``cosine``, mean cosine of the nearest voxel's embedding with the text of the true class, which does not depend on the
+  other classes;
 - ``precision@K``, ``localisation_error_m``, ``localised`` (share of first answers within the box of the nearest true
-  instance), means over the classes that are asked for;
+  instance), means over the queried classes;
 - of the instance layers ``AP25``, ``AP50`` (class-agnostic, by top hypotheses, ranked by the weight of instances),
   ``over_segmentation`` and ``under_segmentation``.
 """
@@ -35,22 +35,22 @@ from fus3dmaps_lab.evaluation.retrieval import instance_scores, majority_classes
 from fus3dmaps_lab.evaluation.segmentation_metrics import ClassSubset, score_segmentation, without_background
 
 INSTANCE_LAYERS = ("instances", "fused_instances")
-"""What a map with a sliding window holds of all that it saw; its dense layer holds the window alone."""
+"""Layers of a map with a sliding window that hold everything it saw; its dense layer holds only the window."""
 
 PRECISION_AT = (1, 3, 5)
 
 
 @dataclass(frozen=True)
 class EvaluationProtocol:
-    """Finer points of an evaluation; the defaults are the published protocol's, but for the rule.
+    """Details of an evaluation. The defaults are those of the published protocol, except the rule.
 
     Attributes:
-        rule: Where a class must be likely to be predicted, see :mod:`fus3dmaps_lab.evaluation.prediction`.
-        min_peak: How likely it must be there.
-        min_probability: A voxel whose best class is less likely than this gets none.
-        reach_voxels: What is farther from a voxel of the truth is not near it: for coverage, and for whose voxel it is in
-            the quality of instances and in retrieval. Segmentation knows no such limit.
-        min_voxels: Instances that occupy fewer voxels are not ranked in retrieval.
+        rule: Where a class must be likely to be predicted at all, see :mod:`fus3dmaps_lab.evaluation.prediction`.
+        min_peak: Probability that it must reach there.
+        min_probability: Least probability of a voxel's best class; otherwise the voxel gets none.
+        reach_voxels: Greatest distance at which a voxel of the map counts for a voxel of the truth, for coverage, instance
+            quality and retrieval. Segmentation has no such limit.
+        min_voxels: Least number of voxels of an instance that is ranked in retrieval.
     """
 
     rule: Rule = "global"
@@ -72,26 +72,26 @@ def evaluate_map(
     protocol: EvaluationProtocol | None = None,
     truth_without_background: VoxelTruth | None = None,
 ) -> dict[str, dict[str, float]]:
-    """Evaluate layers of a map, which nobody may change meanwhile.
+    """Evaluate layers of a map, which must not change meanwhile.
 
     Args:
-        semantic_map: The map; one with a window should have been fused.
+        semantic_map: The map; with a window, it should have been fused.
         texts: Encoder of the class names, or (c, d) embeddings of classes 1 .. c, any length but 0.
-        truth: With all classes.
-        class_names: Name of each class by its number; the first is of nothing and is never asked for.
+        truth: The truth with all classes.
+        class_names: Name of each class by its number; the first stands for nothing and is never queried.
         background: Numbers of the background classes.
-        layers: Which of LAYERS.
+        layers: Some of LAYERS.
         logit_scale: Factor of the cosines in the softmax.
-        k: A voxel of the truth takes the mode of so many nearest voxels of the map; 0 takes the very same voxel.
-        protocol: Finer points; the defaults without.
-        truth_without_background: Truth in which a voxel that shows any other class is not of a background class, as
-            :func:`voxel_truth_from_frames` makes it; without, the truth with these classes removed.
+        k: Number of nearest voxels of the map whose most frequent class a voxel of the truth gets; 0 takes the same voxel.
+        protocol: Details; None takes the defaults.
+        truth_without_background: Truth in which a voxel that shows any other class has no background class, as made by
+            :func:`voxel_truth_from_frames`. None takes the truth with background classes removed.
 
     Returns:
-        Metrics by name, by layer; NaN where one is undefined.
+        Metrics by name, by layer; NaN if undefined.
 
     Raises:
-        MapError: The truth has another voxel size, a class without a name, or the texts do not fit the classes.
+        MapError: The truth has another voxel size, a class has no name, or the texts do not fit the classes.
         QueryError: A layer is unknown.
     """
     plain = truth_without_background or truth.without(background)
@@ -118,7 +118,7 @@ def _check_truth(truth: VoxelTruth, voxel_size_m: float, class_names: Sequence[s
 
 @dataclass(frozen=True)
 class _View:
-    """Which classes are looked at, the ending of its metrics, and the truth of it."""
+    """A choice of classes, with the ending of its metrics' names and its truth."""
 
     ending: str
     subset: ClassSubset
@@ -126,7 +126,7 @@ class _View:
 
 
 class _Judge:
-    """What is the same for all layers of a map."""
+    """The parts of an evaluation that all layers of a map share."""
 
     def __init__(
         self, semantic_map: SemanticMap, truth: VoxelTruth, logit_scale: float, k: int, protocol: EvaluationProtocol
@@ -214,7 +214,7 @@ class _Judge:
         }
 
     def _neighbours(self, keys: NDArray[np.int64], truth: VoxelTruth) -> Neighbours:
-        """The nearest voxels; layers often have the same ones."""
+        """Find the nearest voxels, once for layers with the same voxels."""
         positions = truth.positions
         for known_keys, known_positions, neighbours in self._nearest:
             if np.array_equal(known_keys, keys) and np.array_equal(known_positions, positions):
@@ -225,7 +225,7 @@ class _Judge:
 
 
 def _of_nearest(near: Neighbours, values: NDArray[np.int64], reach_voxels: float) -> NDArray[np.int64]:
-    """Value of the nearest voxel, -1 where there is none within reach."""
+    """Return the value of the nearest voxel, -1 if none is within reach."""
     if not near.places.shape[1]:
         return np.full(len(near.places), -1, np.int64)
     return np.where(near.distances[:, 0] <= reach_voxels, values[near.places[:, 0]], -1)

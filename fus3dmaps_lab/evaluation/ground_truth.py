@@ -1,4 +1,4 @@
-"""What is truly where, voxel by voxel: from labelled points, or from label images lifted through depth and poses."""
+"""True class and instance of every voxel, from labelled points or from label images with depth and poses."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from fus3dmaps_core.geometry.projection import resize_frame, unproject
 from fus3dmaps_core.voxel_map.kernels.keys import MAX_COORDINATE, pack, unpack
 
 Rounding = Literal["floor", "round"]
-"""Which voxel a point is in: floor(p / size), as in the map, or round(p / size), as in the published protocol."""
+"""Voxel of a point: floor(p / size), as in the map, or round(p / size), as in the published protocol."""
 
 NOTHING = 0
 """Class of a voxel that is not evaluated, instance of one that belongs to no object, class of a missing prediction."""
 
-_ROWS_KEPT = 2**22  # Votes that are held before equal ones are summed.
+_ROWS_KEPT = 2**22  # Number of votes that are stored before equal ones are summed.
 
 
 @dataclass(frozen=True)
 class VoxelTruth:
-    """Class and instance of every voxel that is known.
+    """True class and instance of all known voxels.
 
     Attributes:
         keys: (n, 3) int64 voxel indices, all different.
-        classes: (n,) int32, NOTHING where the voxel is not evaluated.
-        instances: (n,) int32, NOTHING where it belongs to none.
+        classes: (n,) int32, NOTHING if the voxel is not evaluated.
+        instances: (n,) int32, NOTHING if it belongs to none.
         voxel_size_m: Edge of a voxel, metres.
-        rounding: Where the voxels lie: index i spans [i, i + 1) sizes for ``floor``, [i - 0.5, i + 0.5) for ``round``.
+        rounding: Place of the voxels: index i spans [i, i + 1) sizes for ``floor``, [i - 0.5, i + 0.5) for ``round``.
     """
 
     keys: NDArray[np.int64]
@@ -45,7 +45,7 @@ class VoxelTruth:
     rounding: Rounding = "floor"
 
     def __post_init__(self) -> None:
-        """Raise MapError unless the arrays go together."""
+        """Raise MapError unless the arrays fit together."""
         count = len(self.keys)
         if self.keys.shape != (count, 3) or self.classes.shape != (count,) or self.instances.shape != (count,):
             shapes = f"{self.keys.shape}, {self.classes.shape}, {self.instances.shape}"
@@ -55,16 +55,16 @@ class VoxelTruth:
 
     @property
     def positions(self) -> NDArray[np.float64]:
-        """(n, 3) float64, where the voxels lie on the map's grid, in voxels: whole numbers are its own voxels."""
+        """Places on the map's grid, (n, 3) float64, in voxels; whole numbers are voxels of the grid itself."""
         return self.keys.astype(np.float64) - (0.5 if self.rounding == "round" else 0.0)
 
     @property
     def centers_m(self) -> NDArray[np.float64]:
-        """(n, 3) float64 centres of the voxels, metres, map frame."""
+        """Centres of the voxels, (n, 3) float64, metres, map frame."""
         return np.asarray((self.positions + 0.5) * self.voxel_size_m)
 
     def without(self, ignored: Iterable[int]) -> VoxelTruth:
-        """The same voxels, where those of the given classes are not evaluated and belong to no instance."""
+        """Copy the truth; voxels of the given classes are not evaluated and belong to no instance."""
         gone = np.isin(self.classes, list(ignored))
         classes, instances = np.where(gone, NOTHING, self.classes), np.where(gone, NOTHING, self.instances)
         return replace(self, classes=classes.astype(np.int32), instances=instances.astype(np.int32))
@@ -72,14 +72,14 @@ class VoxelTruth:
 
 @dataclass(frozen=True)
 class LabelledDepth:
-    """A depth image, and the class and instance that each of its pixels shows.
+    """A depth image with the class and instance of each pixel.
 
     Attributes:
         depth_m: (H, W) float32 metres along the optical axis, 0 where there is no valid reading.
         intrinsics: Camera model of the depth image.
         T_world_camera: (4, 4) float64 pose of the optical frame in the map frame.
         classes: (H, W) integers, NOTHING where unknown.
-        instances: (H, W) integers, NOTHING where there is none; None where they are not known at all.
+        instances: (H, W) integers, NOTHING where there is none; None if instances are not known at all.
     """
 
     depth_m: NDArray[np.float32]
@@ -89,7 +89,7 @@ class LabelledDepth:
     instances: NDArray[np.integer] | None = None
 
     def __post_init__(self) -> None:
-        """Raise FrameError (reason ``size_mismatch``) unless the images are of one size."""
+        """Raise FrameError (reason ``size_mismatch``) unless the images have the same size."""
         for name, image in (("classes", self.classes), ("instances", self.instances)):
             if image is not None and image.shape != self.depth_m.shape:
                 raise FrameError(f"{name}: image is {image.shape}, depth {self.depth_m.shape}", reason="size_mismatch")
@@ -98,10 +98,10 @@ class LabelledDepth:
 def labelled_depth(
     frame: PosedFrame, classes: NDArray[np.integer], instances: NDArray[np.integer] | None, image: ImageConfig
 ) -> LabelledDepth:
-    """A labelled frame at the resolution, and with the depth, that the map works with; labels by nearest neighbour.
+    """Bring a labelled frame to the map's working resolution and depth range; labels are resized by nearest neighbour.
 
     Args:
-        frame: As the map gets it.
+        frame: The frame that the map gets.
         classes: (H, W) integers, of the same field of view.
         instances: (H, W) integers, or None.
         image: Working resolution and range of depth.
@@ -113,12 +113,12 @@ def labelled_depth(
 
 
 def voxel_keys(points_m: NDArray[np.floating], voxel_size_m: float, rounding: Rounding = "floor") -> NDArray[np.int64]:
-    """Voxel of each point.
+    """Compute the voxel of each point.
 
     Args:
         points_m: (n, 3) metres, map frame.
         voxel_size_m: Edge of a voxel, metres.
-        rounding: Which voxel a point is in; halves are rounded to even.
+        rounding: Voxel of a point; halves are rounded to even.
 
     Returns:
         (n, 3) int64.
@@ -130,7 +130,7 @@ def voxel_keys(points_m: NDArray[np.floating], voxel_size_m: float, rounding: Ro
     if points.ndim != 2 or points.shape[1] != 3:
         raise MapError(f"points_m: must be (n, 3), got {points.shape}")
     scaled = points / voxel_size_m
-    if not np.all(np.abs(scaled) < MAX_COORDINATE):  # Also of what is not a number.
+    if not np.all(np.abs(scaled) < MAX_COORDINATE):  # Also true of NaN.
         raise MapError(f"points_m: must be finite and within {MAX_COORDINATE} voxels of the origin")
     return np.asarray(np.floor(scaled) if rounding == "floor" else np.rint(scaled)).astype(np.int64)
 
@@ -142,16 +142,16 @@ def voxel_truth(
     voxel_size_m: float,
     rounding: Rounding = "floor",
 ) -> VoxelTruth:
-    """Truth from labelled points: of each voxel the class of most of its points, NOTHING being one like any other.
+    """Make the truth from labelled points. A voxel gets the class of most of its points, which may be NOTHING.
 
-    The instance is that of most points of this class. Ties: the lowest number.
+    Its instance is that of most points of this class. Ties go to the lowest number.
 
     Args:
         points_m: (n, 3) metres, map frame.
-        classes: (n,) integers, NOTHING where a point is not evaluated.
-        instances: (n,) integers, NOTHING where it belongs to none.
+        classes: (n,) integers, NOTHING if a point is not evaluated.
+        instances: (n,) integers, NOTHING if it belongs to none.
         voxel_size_m: Edge of a voxel, metres.
-        rounding: Which voxel a point is in.
+        rounding: Voxel of a point.
 
     Returns:
         Voxels in ascending order of their keys.
@@ -170,17 +170,17 @@ def voxel_truth_from_frames(
     ignored: frozenset[int] = frozenset(),
     rounding: Rounding = "floor",
 ) -> VoxelTruth:
-    """Truth from label images, lifted through the depth and poses that the map gets.
+    """Make the truth from label images, with the depth and poses that the map gets.
 
-    A voxel's class is the one of most of its pixels in all frames, of the classes that are kept: a voxel that shows any of
-    them has one of them, however many of its pixels are ignored. (That is the largest component of the mean one-hot vector.)
-    The instance is that of most pixels of this class. Ties: the lowest number.
+    A voxel gets the kept class of most of its pixels in all frames. A voxel that shows any kept class gets one of them,
+    however many of its pixels are ignored. (That is the largest component of the mean one-hot vector.) Its instance is that
+    of most pixels of this class. Ties go to the lowest number.
 
     Args:
-        frames: Label images with depth and pose.
+        frames: Label images with depth and poses.
         voxel_size_m: Edge of a voxel, metres.
-        ignored: Classes that are not kept, beside NOTHING.
-        rounding: Which voxel a point is in.
+        ignored: Classes that are not kept, besides NOTHING.
+        rounding: Voxel of a point.
 
     Returns:
         Voxels in ascending order of their keys.
@@ -198,7 +198,7 @@ def voxel_truth_from_frames(
 
 
 class _Votes:
-    """How often each voxel was seen with each pair of class and instance."""
+    """Counts of how often each voxel was seen with each pair of class and instance."""
 
     def __init__(self, voxel_size_m: float, rounding: Rounding) -> None:
         self._voxel_size_m, self._rounding = voxel_size_m, rounding
@@ -221,7 +221,7 @@ class _Votes:
             self._rows = len(self._parts[0][0])
 
     def truth(self, last_choice: frozenset[int]) -> VoxelTruth:
-        """Of each voxel the class of most votes; those of ``last_choice`` only where there is no other, and as NOTHING."""
+        """Give each voxel the class of most votes; classes of ``last_choice`` lose to all others and become NOTHING."""
         voxels, classes, instances, counts = self._all()
         classes = np.where(np.isin(classes, list(last_choice)), NOTHING, classes)
         voxels, classes, instances, counts = _summed(voxels, classes, instances, counts)
@@ -249,7 +249,7 @@ class _Votes:
 def _summed(
     voxels: NDArray[np.int64], classes: NDArray[np.int64], instances: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], ...]:
-    """Equal rows once, in ascending order, with the sum of their counts."""
+    """Merge equal rows, in ascending order, and sum their counts."""
     if not len(voxels):
         return voxels, classes, instances, counts
     order = np.lexsort((instances, classes, voxels))
@@ -259,7 +259,7 @@ def _summed(
 
 
 def _first_of_each(voxels: NDArray[np.int64], labels: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Of each voxel, in ascending order, the place of its highest count, of equal ones that of the lowest label."""
+    """Find for each voxel, in ascending order, the place of its highest count; ties go to the lowest label."""
     order = np.lexsort((labels, -counts, voxels))
     return order[np.flatnonzero(np.diff(voxels[order], prepend=-1))]
 

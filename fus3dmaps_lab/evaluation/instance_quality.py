@@ -1,7 +1,7 @@
-"""How well the objects of a map are the true objects, whatever they are called.
+"""Agreement of a map's instances with the true ones, whatever their class.
 
-Both are sets of voxels of the truth: a voxel of the truth belongs to the instances of the map's voxel that speaks for it.
-The sets of a map may overlap (all hypotheses of a voxel) or not (its top hypothesis only); true ones never do.
+Instances are sets of voxels of the truth. A voxel of the truth belongs to the instances of the map's voxel nearest to it. A
+map's instances may overlap (all hypotheses of a voxel) or not (its top hypothesis only); true ones never overlap.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from fus3dmaps_core.errors import MapError
 
 @dataclass(frozen=True)
 class Overlaps:
-    """Which predicted instances share how many voxels with which true ones.
+    """Numbers of voxels that predicted and true instances share.
 
     Attributes:
-        predicted: (p,) places of predicted instances, of the pairs that overlap.
-        true: (p,) places of true ones.
-        shared: (p,) int64 voxels of both.
+        predicted: (p,) places of the predicted instances of all overlapping pairs.
+        true: (p,) places of the true instances of these pairs.
+        shared: (p,) int64 shared voxels of these pairs.
         predicted_sizes: (a,) int64 voxels of each predicted instance.
         true_sizes: (b,) int64 voxels of each true instance.
         ids: (b,) int32 number of each true instance.
@@ -36,7 +36,7 @@ class Overlaps:
 
     @property
     def iou(self) -> NDArray[np.float64]:
-        """(p,) intersection over union of each pair."""
+        """Intersection over union of each pair, (p,)."""
         unions = self.predicted_sizes[self.predicted] + self.true_sizes[self.true] - self.shared
         return np.asarray(self.shared / unions)
 
@@ -47,14 +47,14 @@ def overlaps(
     """Count the voxels that predicted and true instances share.
 
     Args:
-        members: (m,) places of voxels of the truth that belong to a predicted instance; a voxel of several comes several
-            times, but with an instance once.
-        predicted_of_member: (m,) which instance, in 0 .. count - 1.
+        members: (m,) places of voxels of the truth that belong to a predicted instance. A voxel may come several times, but
+            only once for each instance.
+        predicted_of_member: (m,) predicted instance of each, in 0 .. count - 1.
         count: Number of predicted instances.
         true: (n,) true instance of each voxel, 0 for none.
 
     Raises:
-        MapError: The members differ in length, or an instance is out of range.
+        MapError: The arrays of members differ in length, or an instance is out of range.
     """
     if members.shape != predicted_of_member.shape:
         raise MapError(f"members: {members.shape} voxels do not go with {predicted_of_member.shape} instances")
@@ -74,16 +74,16 @@ def overlaps(
 
 
 def average_precision(overlap: Overlaps, scores: NDArray[np.floating], min_iou: float) -> float:
-    """Average precision of predicted instances, best score first: mean over the true ones of the precision as each is found.
+    """Compute the average precision: the mean over true instances of the precision at the point where each is found.
 
-    In turn, each predicted instance takes the true one of highest IoU that is not taken yet, if this reaches ``min_iou``
-    (ties: the lowest place), and is right then. One that takes none, and of whose voxels most belong to no true instance,
-    is left out: what is not labelled is not wrong. So are those without any voxel of the truth.
+    In order of falling score, each predicted instance takes the free true one with the highest IoU of at least ``min_iou``
+    (ties: the lowest place) and is then right. If it takes none and most of its voxels belong to no true instance, it is
+    left out, because unlabelled does not mean wrong. Predicted instances without any voxel of the truth are left out too.
 
     Args:
-        overlap: Of the instances.
-        scores: (a,) how sure the map is of each; ties: the lower place first.
-        min_iou: In (0, 1].
+        overlap: Overlaps of the instances.
+        scores: (a,) score of each predicted instance; ties: the lower place first.
+        min_iou: Least IoU, in (0, 1].
 
     Returns:
         In [0, 1]; NaN if there is no true instance.
@@ -98,13 +98,13 @@ def average_precision(overlap: Overlaps, scores: NDArray[np.floating], min_iou: 
 
 @dataclass(frozen=True)
 class Partition:
-    """Whether objects come in pieces, or stick together; 1 is perfect, NaN where nothing is covered.
+    """Over- and under-segmentation; 1 is perfect, NaN means that nothing is covered.
 
     Attributes:
-        over_segmentation: Predicted instances per true one; of those predicted that have more than half of their voxels
-            in one true instance, and of those true ones that have such.
-        under_segmentation: True instances per predicted one; of those true that have more than half of their voxels in
-            one predicted instance, and of those predicted ones that have such.
+        over_segmentation: Mean number of predicted instances per true one. A predicted instance counts for the true one
+            that has more than half of its voxels; true ones without any do not count.
+        under_segmentation: Mean number of true instances per predicted one. A true instance counts for the predicted one
+            that has more than half of its voxels; predicted ones without any do not count.
     """
 
     over_segmentation: float
@@ -112,19 +112,19 @@ class Partition:
 
 
 def partition(overlap: Overlaps) -> Partition:
-    """Over- and under-segmentation of predicted instances."""
+    """Compute over- and under-segmentation of predicted instances."""
     in_true = 2 * overlap.shared > overlap.predicted_sizes[overlap.predicted]
     in_predicted = 2 * overlap.shared > overlap.true_sizes[overlap.true]
     return Partition(_mean_group(overlap.true[in_true]), _mean_group(overlap.predicted[in_predicted]))
 
 
 def _mean_group(groups: NDArray[np.int64]) -> float:
-    """Mean size of the groups that have a member."""
+    """Compute the mean size of the groups that have a member."""
     return len(groups) / len(np.unique(groups)) if len(groups) else float("nan")
 
 
 def _matched(overlap: Overlaps, scores: NDArray[np.floating], min_iou: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """By falling score, which predicted instances take a true one, and which are counted at all."""
+    """Return, by falling score, which predicted instances take a true one, and which are counted at all."""
     inside = np.bincount(overlap.predicted, weights=overlap.shared, minlength=len(overlap.predicted_sizes))
     counted = 2 * inside > overlap.predicted_sizes
     iou = overlap.iou

@@ -1,8 +1,8 @@
-"""Which voxels of a map speak for a voxel of the truth: its nearest ones, whatever lies between."""
+"""Matching of the truth's voxels with the nearest voxels of a map, at any distance."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -11,19 +11,18 @@ from scipy.spatial import cKDTree
 
 from fus3dmaps_core.errors import MapError
 from fus3dmaps_core.voxel_map.kernels.keys import pack
-from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth
 
 _BLOCK_ROWS = 2**14
-_SPARE = 8  # Neighbours asked for beyond k, so that most ties at the last place are seen at once.
+_SPARE = 8  # Neighbours asked for beyond k, so that most ties at the last place are seen in one query.
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The nearest voxels of a map, nearest first; of equally near ones, those of lower x, then y, then z.
+    """The nearest voxels of a map, nearest first; ties go to lower x, then y, then z.
 
     Attributes:
-        places: (n, k) int64, where in the map's voxels; fewer columns if the map has fewer than k.
-        distances: (n, k) float64, between centres, in voxels.
+        places: (n, k) int64 places among the map's voxels; fewer columns if the map has fewer than k.
+        distances: (n, k) float64 distances between centres, in voxels.
     """
 
     places: NDArray[np.int64]
@@ -33,13 +32,13 @@ class Neighbours:
 def nearest_voxels(
     positions: NDArray[np.number], predicted_keys: NDArray[np.integer], k: int, workers: int = -1
 ) -> Neighbours:
-    """The k nearest voxels of a map to each position. The result does not depend on the order of voxels.
+    """Find the k nearest voxels of a map for each position. The result does not depend on the order of voxels.
 
     Args:
         positions: (n, 3) on the map's grid, in voxels; whole or half numbers (:attr:`VoxelTruth.positions`).
         predicted_keys: (m, 3) voxel indices of the map, all different.
-        k: How many.
-        workers: Threads; -1 takes all processors.
+        k: Number of neighbours.
+        workers: Number of threads; -1 takes all processors.
 
     Raises:
         MapError: A position is neither a whole nor a half number, or k is less than 1.
@@ -54,7 +53,7 @@ def nearest_voxels(
     squares = np.empty((len(doubled), count), np.int64)
     if count and len(doubled):
         order = np.argsort(pack(torch.from_numpy(np.ascontiguousarray(predicted_keys, np.int64))).numpy())
-        # Not balanced: positions far outside of the map are then looked up twice as fast.
+        # Not balanced, because positions far outside the map are then looked up twice as fast.
         tree = cKDTree(2.0 * predicted_keys[order], balanced_tree=False)
         for first in range(0, len(doubled), _BLOCK_ROWS):
             rows = slice(first, first + _BLOCK_ROWS)
@@ -63,45 +62,17 @@ def nearest_voxels(
     return Neighbours(places, np.sqrt(squares) / 2)
 
 
-def match_predictions(
-    truth_keys: NDArray[np.number],
-    predicted_keys: NDArray[np.integer],
-    predicted_classes: NDArray[np.integer],
-    k: int = 5,
-) -> NDArray[np.int32]:
-    """Predicted class of each voxel of the truth.
-
-    Args:
-        truth_keys: (n, 3) voxel indices on the map's grid, or half numbers where the truth's voxels lie between
-            (:attr:`VoxelTruth.positions`).
-        predicted_keys: (m, 3) voxel indices of the map, all different.
-        predicted_classes: (m,) class of each, 0 for none.
-        k: The class is the mode of that many nearest voxels, however far they are; 0 takes the very same voxel.
-
-    Returns:
-        (n,) int32; 0 where the prediction is none, or missing.
-
-    Raises:
-        MapError: With k = 0 the truth is not on the map's grid.
-    """
-    if k == 0:
-        same = same_voxels(truth_keys, predicted_keys)
-        classes = np.append(np.asarray(predicted_classes, np.int32), np.int32(0))
-        return classes[same]
-    return mode_of_neighbours(nearest_voxels(truth_keys, predicted_keys, k), predicted_classes)
-
-
 def mode_of_neighbours(neighbours: Neighbours, predicted_classes: NDArray[np.integer]) -> NDArray[np.int32]:
-    """The most frequent class among the neighbours, none (0) being one like any other; ties: the lowest number.
+    """Return the most frequent class among the neighbours, which may be none (0). Ties go to the lowest number.
 
-    That is what ``torch.mode`` gives, which the published protocol takes.
+    The result is that of ``torch.mode``, which the published protocol uses.
 
     Args:
-        neighbours: Of n positions.
+        neighbours: Neighbours of n positions.
         predicted_classes: (m,) class of each voxel of the map.
 
     Returns:
-        (n,) int32, 0 where there is no neighbour.
+        (n,) int32, 0 without neighbours.
     """
     mode = np.zeros(len(neighbours.places), np.int32)
     if not neighbours.places.shape[1]:
@@ -112,26 +83,13 @@ def mode_of_neighbours(neighbours: Neighbours, predicted_classes: NDArray[np.int
         frequency = np.zeros(classes.shape, np.int32)
         for column in range(classes.shape[1]):
             frequency += classes == classes[:, column, None]
-        # Sorted, so that the first of the most frequent is the lowest.
+        # Classes are sorted, so the first of the most frequent ones is the lowest.
         mode[rows] = classes[np.arange(len(classes)), frequency.argmax(axis=1)]
     return mode
 
 
-def seen_truth(truth: VoxelTruth, seen_keys: NDArray[np.integer], reach_voxels: float = 2.0) -> VoxelTruth:
-    """The part of a truth that a map can know of, where the truth has more than was ever seen.
-
-    Args:
-        truth: Of everything.
-        seen_keys: (m, 3) voxel indices of a map that has seen all that there was to see, all different.
-        reach_voxels: How far a voxel of the truth may be from the nearest of these, in voxels.
-    """
-    near = nearest_voxels(truth.positions, seen_keys, 1)
-    kept = np.any(near.distances <= reach_voxels, axis=1)
-    return replace(truth, keys=truth.keys[kept], classes=truth.classes[kept], instances=truth.instances[kept])
-
-
 def same_voxels(positions: NDArray[np.number], predicted_keys: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Where in the map's voxels each position is, -1 for one that the map lacks.
+    """Find the place of each position among the map's voxels, -1 if the map does not have it.
 
     Args:
         positions: (n, 3) voxel indices.
@@ -154,21 +112,21 @@ def same_voxels(positions: NDArray[np.number], predicted_keys: NDArray[np.intege
 def _nearest(
     tree: cKDTree, points: NDArray[np.float64], count: int, workers: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Squared distances and ranks of the nearest ``count`` points of the tree, of equally near ones the lowest ranks."""
+    """Return squared distances and ranks of the nearest ``count`` points of the tree; ties go to the lowest ranks."""
     squares = np.empty((len(points), count), np.int64)
     ranks = np.empty((len(points), count), np.int64)
     left, asked = np.arange(len(points)), count + _SPARE
     while len(left):
         asked = min(asked, tree.n)
         distances, found = tree.query(points[left], k=np.arange(1, asked + 1), workers=workers)
-        # Between whole numbers: exact once rounded, for the root is off by less than the squares are apart.
+        # Squares of whole numbers are exact once rounded: the error of the root is smaller than their spacing.
         exact = np.rint(distances**2).astype(np.int64)
         by_rank = np.argsort(found, axis=1)
         exact, found = (np.take_along_axis(each, by_rank, axis=1) for each in (exact, found))
         chosen = np.argsort(exact, axis=1, kind="stable")
         exact, found = (np.take_along_axis(each, chosen, axis=1) for each in (exact, found))
         squares[left], ranks[left] = exact[:, :count], found[:, :count]
-        # Where the last that was seen is as near as the last that is taken, there may be equally near ones unseen.
+        # If the last one seen is as near as the last one taken, others at that distance may be unseen.
         left = left[exact[:, -1] == exact[:, count - 1]] if asked < tree.n else left[:0]
         asked *= 2
     return squares, ranks

@@ -1,4 +1,4 @@
-"""Memory against mapped volume on a large simulated building: whole dense map, sliding window, and what is predicted."""
+"""Memory against mapped volume in a large simulated building: whole dense map, sliding window, and prediction."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _TRIAL_STEP = 10_000
 
 @dataclass(frozen=True)
 class MemoryStudy:
-    """What is built and how it is mapped.
+    """The building of a memory study, and how it is mapped.
 
     Attributes:
-        storeys: Of the building.
-        rooms_per_storey: Of the building.
-        frames: Along the route; None takes as many as the rooms need.
+        storeys: Number of storeys.
+        rooms_per_storey: Number of rooms on each storey.
+        frames: Number of frames along the route; None takes as many as the rooms need.
         room_size_m: Least and greatest edge of a room.
         dimension: Width of the embeddings.
-        window_radius_m: Of the map with a window.
-        measurements: How often memory is looked at, evenly along the route.
+        window_radius_m: Radius of the map with a window.
+        measurements: Number of measurements, evenly along the route.
     """
 
     storeys: int = 3
@@ -45,14 +45,14 @@ class MemoryStudy:
 def memory_curves(
     study: MemoryStudy, seed: int, on_progress: Callable[[int, int], object] | None = None
 ) -> list[CurvePoint]:
-    """Map a building with and without a window, and look at the bytes that each map has allocated on the way.
+    """Map a building with and without a window, and measure the allocated bytes of each map along the route.
 
-    The prediction is the memory of a voxel, measured on a map of another making (:func:`bytes_per_voxel`), times the voxels.
+    The prediction is the number of voxels times the bytes of a voxel, measured on another map (:func:`bytes_per_voxel`).
 
     Args:
-        study: What is built.
-        seed: Of the building.
-        on_progress: Called with the number of frames mapped, and of all.
+        study: The building.
+        seed: Seed of the building.
+        on_progress: Called with the number of frames mapped and of all frames.
     """
     building = SimulatedBuilding(
         seed=seed,
@@ -90,12 +90,13 @@ def memory_curves(
 
 
 def bytes_per_voxel(config: Config, dimension: int) -> float:
-    """Allocated bytes a voxel of a map whose voxels all have a dense embedding, and no instance.
+    """Measure the allocated bytes per voxel of a map whose voxels all have a dense embedding and no instance.
 
-    What is allocated ahead grows by doubling, so that bytes a voxel rise and fall; this is their mean over one doubling.
+    Memory allocated in advance grows by doubling, so bytes per voxel rise and fall; the result is their mean over one
+    doubling.
 
     Args:
-        config: Of the map.
+        config: Configuration of the map.
         dimension: Width of the embeddings.
     """
     trial = SemanticMap(dimension, config.map, 1.0, 0.0)

@@ -1,7 +1,7 @@
-"""The numbers that FUS3DMaps (Homberger et al.) reports, row by row, to stand beside ours.
+"""The numbers reported by FUS3DMaps (Homberger et al.), row by row, for comparison with ours.
 
-Metrics bear the names of our records: its fmIoU is ``f-mIoU``, its Acc and mAcc are ``accuracy`` (its protocol computes the
-share of voxels right). Its results on a dataset are averages over that dataset's scenes, listed in SCENES.
+Metrics have the names of our records: the paper's fmIoU is ``f-mIoU``, its Acc and mAcc are ``accuracy`` (its protocol
+computes the share of right voxels). Its results on a dataset are averages over that dataset's scenes, listed in SCENES.
 """
 
 from __future__ import annotations
@@ -19,9 +19,6 @@ SCENES: dict[str, tuple[str, ...]] = {
     HM3DSEM: ("00824", "00829", "00843", "00847", "00873", "00877", "00890"),
 }
 """Scenes that the paper averages over, by dataset."""
-
-VARIANCE_RATIOS = {NARADIO: 1.0, CLIP_DINOISER: 5.0}
-"""The lambda that the paper chose for each pair of encoders."""
 
 TABLES = (
     "instance maps",
@@ -44,15 +41,15 @@ class PaperRow:
 
     Attributes:
         table: One of TABLES.
-        dataset: Dataset it is averaged over, or the scene of a memory measurement.
-        method: Whose map it is.
+        dataset: Dataset of the average, or the scene of a memory measurement.
+        method: Method that made the map.
         layer: One of the records' LAYERS; ``all`` for what belongs to the whole map.
         mode: One of the records' MODES; ``no fusion`` for a frame rate while nothing is fused.
-        background: Whether background classes count; None where classes play no part. Instance layers are reported without.
+        background: Whether background classes count (for instance layers they never do); None if classes do not matter.
         metric: ``mIoU``, ``f-mIoU``, ``accuracy``, ``MiB`` or ``Hz``.
         value: The number.
         variance_ratio: Lambda of the sweep, None elsewhere.
-        device: What a frame rate was measured on, else empty.
+        device: Device of a frame rate, else empty.
     """
 
     table: str
@@ -70,7 +67,7 @@ class PaperRow:
 def _scores(
     table: str, method: str, layer: str, columns: Iterable[tuple[str, bool]], values: str, mode: str = "full"
 ) -> Iterator[PaperRow]:
-    """Rows of one method: a line of values for each metric, with a column for each dataset and handling of background."""
+    """Make the rows of one method: a line of values per metric, a column per dataset and handling of background."""
     lines = zip(_METRICS, values.strip().splitlines(), strict=True)
     for metric, line in lines:
         for (dataset, background), value in zip(columns, line.split(), strict=True):

@@ -1,7 +1,7 @@
-"""Plots of an evaluation, drawn without a display and without touching matplotlib's global state.
+"""Plots of an evaluation, drawn without a display and without changing matplotlib's global state.
 
-Colours are Okabe and Ito's, told apart with any colour vision; no curve is told from another by colour alone. Every title
-says "simulation" where the numbers are one.
+Colours are those of Okabe and Ito, which can be distinguished with any colour vision; no curve differs from another by
+colour alone. Plots of simulations say so in their titles.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "#8A8A8A"
 
 ASSOCIATION_METRICS = ("mIoU", "AP25", "AP50", "instances")
-"""Metrics of the experiment ``association`` that are drawn, as far as they were measured."""
+"""Metrics of the experiment ``association`` that are drawn if they were measured."""
 
 _GIB, _MIB = 2.0**30, 2.0**20
 _DPI = 160
@@ -46,7 +46,7 @@ _STYLE = {
     "axes.spines.top": False,
     "axes.titlesize": 11,
     "figure.facecolor": "white",
-    "font.family": "DejaVu Sans",  # Comes with matplotlib: the same on every machine.
+    "font.family": "DejaVu Sans",  # Comes with matplotlib, so it is the same on every machine.
     "font.size": 9,
     "grid.color": "#E3E3E3",
     "legend.frameon": False,
@@ -62,7 +62,7 @@ _R = TypeVar("_R")
 
 @contextmanager
 def _style() -> Iterator[None]:
-    """Our settings over matplotlib's defaults, whatever the user's own are, which are back afterwards."""
+    """Use our settings over matplotlib's defaults inside the ``with`` block; restore the user's settings afterwards."""
     with mpl.rc_context():
         mpl.rcdefaults()
         parameters: Any = mpl.rcParams
@@ -80,10 +80,10 @@ def _styled(draw: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def image_bytes(figure: Figure, form: str = "png") -> bytes:
-    """A figure as the content of a PNG or SVG file: the same bytes for the same data and release of matplotlib.
+    """Render a figure as a PNG or SVG file: the same bytes for the same data and release of matplotlib.
 
     Args:
-        figure: Drawn by a function of this module.
+        figure: Figure drawn by a function of this module.
         form: ``png`` or ``svg``.
     """
     stream = io.BytesIO()
@@ -95,13 +95,13 @@ def image_bytes(figure: Figure, form: str = "png") -> bytes:
 
 @_styled
 def class_plot(records: Sequence[Record], effect: Effect) -> Figure | None:
-    """IoU of every class under both conditions of an effect, classes ordered by what it changes.
+    """Draw the IoU of every class under both conditions of an effect, classes ordered by the change.
 
-    Points are means over scenes and seeds where both are defined, lines their standard deviation.
+    Points are means over the scenes and seeds that have both values; lines are standard deviations.
 
     Args:
-        records: Of one group.
-        effect: Whose conditions are drawn.
+        records: Records of one group.
+        effect: Effect whose conditions are drawn.
 
     Returns:
         The figure; None without a class that both conditions have.
@@ -140,11 +140,11 @@ def class_plot(records: Sequence[Record], effect: Effect) -> Figure | None:
 
 @_styled
 def lambda_plot(points: Sequence[CurvePoint], metric: str = "mIoU") -> Figure | None:
-    """The lambda sweep: a panel for every noise ratio, the seeds in grey, their mean with a band of one standard deviation.
+    """Draw the lambda sweep: a panel per noise ratio, seeds in grey, their mean with a band of one standard deviation.
 
     Args:
-        points: Of the experiment ``lambda``.
-        metric: Which of its metrics.
+        points: Points of the experiment ``lambda``.
+        metric: One of its metrics.
 
     Returns:
         The figure; None without points of that metric.
@@ -190,10 +190,10 @@ def lambda_plot(points: Sequence[CurvePoint], metric: str = "mIoU") -> Figure | 
 
 @_styled
 def memory_plot(points: Sequence[CurvePoint]) -> Figure | None:
-    """Memory against mapped volume: every measurement, and the predicted line.
+    """Draw memory against mapped volume: every measurement, and the predicted line.
 
     Args:
-        points: Of the experiment ``memory``.
+        points: Points of the experiment ``memory``.
 
     Returns:
         The figure; None without bytes.
@@ -233,12 +233,12 @@ def memory_plot(points: Sequence[CurvePoint]) -> Figure | None:
 
 @_styled
 def window_plot(points: Sequence[CurvePoint], metric: str = "mIoU") -> Figure | None:
-    """Accuracy against the window's radius: a curve for every layer, mean and a band of one standard deviation.
+    """Draw accuracy against the window's radius: a curve per layer, the mean with a band of one standard deviation.
 
     Args:
-        points: Of the experiment ``window_radius``; a radius of 0 or infinity stands for the whole dense layer and is drawn
-            as a level line.
-        metric: Which of its metrics.
+        points: Points of the experiment ``window_radius``. A radius of 0 or infinity stands for the whole dense layer and is
+            drawn as a horizontal line.
+        metric: One of its metrics.
 
     Returns:
         The figure; None without points of that metric.
@@ -265,10 +265,10 @@ def window_plot(points: Sequence[CurvePoint], metric: str = "mIoU") -> Figure | 
 
 @_styled
 def association_plot(points: Sequence[CurvePoint]) -> Figure | None:
-    """Ways to associate proposals with instances: a panel of bars for every metric, lines one standard deviation.
+    """Draw the ways to associate proposals with instances: a panel of bars per metric; lines are one standard deviation.
 
     Args:
-        points: Of the experiment ``association``.
+        points: Points of the experiment ``association``.
 
     Returns:
         The figure; None without any of ASSOCIATION_METRICS.
@@ -309,7 +309,7 @@ def association_plot(points: Sequence[CurvePoint]) -> Figure | None:
 
 
 def _figure(width_in: float, height_in: float, panels: int = 1, legend_below: bool = False) -> tuple[Figure, list[Axes]]:
-    """A figure with panels side by side, and room for a legend under them if there is to be one."""
+    """Make a figure with panels side by side and, if wanted, room for a legend under them."""
     share = _LEGEND_IN / height_in if legend_below else 0.0
     figure = Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(rect=(0, share, 1, 1 - share)))
     FigureCanvasAgg(figure)
@@ -318,7 +318,7 @@ def _figure(width_in: float, height_in: float, panels: int = 1, legend_below: bo
 
 
 def _legend_below(figure: Figure, panels: Sequence[Axes]) -> None:
-    """One legend for panels whose curves bear the same labels."""
+    """Add one legend for panels whose curves have the same labels."""
     handles: dict[str, Any] = {}
     for axes in panels:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
@@ -346,7 +346,7 @@ def _classes(records: Sequence[Record]) -> list[str]:
 
 
 def _class_pair(records: Sequence[Record], effect: Effect, name: str) -> tuple[Spread, Spread] | None:
-    """Spread of a class's IoU under both conditions, over the scenes and seeds where both are defined."""
+    """Compute the spread of a class's IoU under both conditions, over the scenes and seeds that have both."""
     first, second = (values_of(records, condition, CLASS_PREFIX + name) for condition in (effect.first, effect.second))
     both = [unit for unit in first if not math.isnan(first[unit] + second.get(unit, math.nan))]
     return (spread(first[unit] for unit in both), spread(second[unit] for unit in both)) if both else None

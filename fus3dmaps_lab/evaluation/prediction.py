@@ -1,9 +1,8 @@
-"""From similarities to classes: which class a map says each voxel has, and how sure it is.
+"""Prediction of classes from similarities: the class of each voxel, and its probability.
 
-The published protocol takes softmax probabilities over the cosines with all class texts and drops classes of which the map
-is nowhere sure. It does so by chunks of 10,000 voxels, so that its predictions depend on the order of voxels: the rule
-``chunked`` is that one, for comparison. Ours, ``global``, looks at the whole layer at once, and gives every voxel the same
-class in whatever order they come.
+The published protocol takes softmax probabilities over the cosines with all class texts and drops classes that are nowhere
+likely. It works in chunks of 10,000 voxels, so its predictions depend on the order of voxels. The rule ``chunked`` does the
+same, for comparison. Our rule, ``global``, looks at the whole layer at once and does not depend on the order.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 Rule = Literal["global", "chunked"]
-"""Over which voxels a class must be likely somewhere to be predicted at all: the whole layer, or each chunk of it."""
+"""Where a class must be likely at some voxel to be predicted at all: in the whole layer, or in each chunk of it."""
 
 _BLOCK_ROWS = 2**14
 
@@ -27,12 +26,12 @@ _BLOCK_ROWS = 2**14
 def layer_cosines(
     semantic_map: SemanticMap, layer: str, text_vectors: NDArray[np.floating]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Cosine of every voxel of a layer with every text. In a map with a window, the dense layer is what the window holds.
+    """Compute the cosine of every voxel of a layer with every text. The dense layer of a map with a window is the window.
 
-    The map is asked for one text at a time: beside the result, memory does not follow the number of texts.
+    The map is asked for one text at a time, so that only the result grows with the number of texts.
 
     Args:
-        semantic_map: The map, which nobody may change meanwhile.
+        semantic_map: The map, which must not change meanwhile.
         layer: One of LAYERS.
         text_vectors: (c, d) embeddings, any length but 0.
 
@@ -66,17 +65,17 @@ def predict_classes(
     chunk: int = 10_000,
     min_peak: float = 0.5,
 ) -> NDArray[np.int32]:
-    """Class of each voxel: the likeliest of those that are kept, p = softmax over all classes of ``logit_scale`` cos.
+    """Predict the class of each voxel: the likeliest kept one, with p = softmax over all classes of ``logit_scale`` cos.
 
-    A class is kept if its p reaches ``min_peak`` at any voxel, of the layer or, by the rule ``chunked``, of the chunk; what
-    is dropped leaves the others' p as they are. Ties: the lowest class.
+    A class is kept if its p reaches ``min_peak`` at any voxel of the layer or, by the rule ``chunked``, of the chunk.
+    Dropping a class does not change the p of the others. Ties go to the lowest class.
 
     Args:
         cosines: (n, c), one column per class.
         logit_scale: Factor of the cosines.
-        min_probability: A voxel whose best class is less likely than this gets none.
+        min_probability: Least probability of a voxel's best class; otherwise the voxel gets none.
         rule: Where a class must reach ``min_peak``.
-        chunk: Voxels of a chunk, in the order of the rows, for ``chunked``.
+        chunk: Number of voxels (rows) in a chunk, for ``chunked``.
         min_peak: See above; 0 keeps all.
 
     Returns:
@@ -99,14 +98,14 @@ def predict_classes(
 
 
 def top_classes(cosines: NDArray[np.floating], logit_scale: float = 100.0) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-    """The likeliest class of each voxel, of all that there are, and its probability: what is checked for calibration.
+    """Return the likeliest of all classes for each voxel and its probability, from which calibration is computed.
 
     Args:
         cosines: (n, c), one column per class.
         logit_scale: Factor of the cosines in the softmax.
 
     Returns:
-        (n,) int32 in 1 .. c, 0 where there is no class at all; and (n,) float64 in [0, 1].
+        (n,) int32 in 1 .. c, 0 if there is no class at all; and (n,) float64 in [0, 1].
     """
     classes, probabilities = np.zeros(len(cosines), np.int32), np.zeros(len(cosines))
     if not cosines.size:
@@ -118,7 +117,7 @@ def top_classes(cosines: NDArray[np.floating], logit_scale: float = 100.0) -> tu
 
 
 def _probabilities(cosines: NDArray[np.floating], logit_scale: float) -> Iterator[tuple[slice, NDArray[np.float64]]]:
-    """Softmax of each row, block by block."""
+    """Yield the softmax of each row, block by block."""
     for first in range(0, len(cosines), _BLOCK_ROWS):
         rows = slice(first, first + _BLOCK_ROWS)
         logits = np.array(cosines[rows], np.float64, order="C")

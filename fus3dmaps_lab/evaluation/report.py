@@ -39,7 +39,7 @@ from fus3dmaps_lab.evaluation.verdicts import (
 )
 
 PAGE = "report.md"
-"""Name of the page."""
+"""File name of the page."""
 
 _TEMPORARY_SUFFIX = ".writing"
 _MOST_ROWS = 80
@@ -57,18 +57,18 @@ _WARNING = (
 
 @dataclass(frozen=True)
 class _Experiment:
-    """How the report shows one experiment.
+    """The section of the report on one experiment.
 
     Attributes:
-        name: As in the curve points, and of its note.
-        title: Of its section.
-        x_name: What x is, with its unit.
-        shows: What its plot shows.
-        plot: Draws it.
-        verdicts: Computes what it decides.
-        beside: Makes the table that has the paper's numbers, if the paper has any.
-        options: Whether its curves are options, each to be compared with the first one.
-        more: Draws the same for other metrics.
+        name: Name in the curve points and of its note.
+        title: Title of the section.
+        x_name: Name of x with its unit.
+        shows: Caption of the plot.
+        plot: Draws the plot.
+        verdicts: Computes the verdicts.
+        beside: Makes the table with the paper's numbers, if the paper has any.
+        options: Whether its curves are options, each compared with the first one.
+        more: Draws plots of other metrics.
     """
 
     name: str
@@ -146,7 +146,7 @@ _EXPERIMENTS = (
 
 @dataclass
 class _Report:
-    """What will be written: lines of the page, and the files that it refers to."""
+    """The report before it is written: lines of the page, and the files that it refers to."""
 
     page: list[str] = field(default_factory=list)
     verdicts: list[str] = field(default_factory=list)
@@ -162,7 +162,7 @@ class _Report:
             self.say(notes[name].strip())
 
     def table(self, name: str, table: Table) -> None:
-        """Keep a table as CSV, and show it if it is short enough to be read."""
+        """Add a table as CSV file, and show it on the page if it is short enough."""
         self.files[f"{name}.csv"] = table.csv().encode()
         if len(table.rows) > _MOST_ROWS:
             self.say(f"{len(table.rows)} rows in [{name}.csv]({name}.csv).")
@@ -170,7 +170,7 @@ class _Report:
             self.say(table.markdown().rstrip("\n"), f"The same as [{name}.csv]({name}.csv).")
 
     def plot(self, name: str, figure: Figure | None, shows: str) -> bool:
-        """Show a plot; False where there was nothing to draw."""
+        """Add a plot; return False if there is nothing to draw."""
         if figure is None:
             return False
         self.files[f"{name}.png"] = plots.image_bytes(figure)
@@ -181,23 +181,23 @@ class _Report:
 def write_report(directory: Path, records: Sequence[Record], points: Sequence[CurvePoint], notes: Mapping[str, str]) -> Path:
     """Write report.md with the CSV tables and PNG plots that it shows.
 
-    Each file is complete or not there: it is written beside its place and renamed; the page comes last. Files of the
-    directory with other names stay.
+    Every file is written under another name and then renamed, so it is complete or missing. The page comes last. Other files
+    in the directory stay.
 
     Args:
-        directory: Where to; made if missing.
+        directory: Where to write; made if missing.
         records: Results of maps.
-        points: Of the experiments.
-        notes: ``command`` is the command that made the results and ``encoders`` what made the embeddings. Under the name of
-            a group (``simulation``, ``other recordings``, a dataset), an effect (``instances``, ``dense``, ``window``,
-            ``evidence``) or an experiment a note is shown there; any other is shown with its name at the top.
+        points: Curve points of the experiments.
+        notes: Notes by name. ``command`` is the command that made the results, ``encoders`` the name of the encoders. A note
+            with the name of a group (``simulation``, ``other recordings``, a dataset), an effect (``instances``, ``dense``,
+            ``window``, ``evidence``) or an experiment is shown there; any other is shown with its name at the top.
 
     Returns:
         Path of the page.
 
     Raises:
         ComparisonError: Two records have the same scene, seed, layer, mode and metric.
-        StorageError: The directory cannot be made or written to, for instance as the disk is full.
+        StorageError: The directory cannot be made or written to, for example because the disk is full.
     """
     report = _Report()
     groups = grouped(records)

@@ -1,4 +1,4 @@
-"""Whether a map finds what it is asked for: its objects ranked by a text, as a query ranks them."""
+"""Evaluation of retrieval: a map's instances ranked by a text, as a query ranks them."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class TrueObjects:
 
     Attributes:
         ids: (b,) int32.
-        classes: (b,) int32 class of most of its voxels; ties: the lowest.
-        centroids_m: (b, 3) float64 mean of the centres of its voxels, metres, map frame.
-        boxes_min_m: (b, 3) float64 smallest corner of its voxels.
+        classes: (b,) int32 class of most of their voxels; ties: the lowest.
+        centroids_m: (b, 3) float64 mean of the centres of their voxels, metres, map frame.
+        boxes_min_m: (b, 3) float64 smallest corner of their voxels.
         boxes_max_m: (b, 3) float64 largest corner.
     """
 
@@ -35,15 +35,15 @@ class TrueObjects:
 
 @dataclass(frozen=True)
 class RetrievalScores:
-    """Answers to one text for each class that was asked for.
+    """Scores of the answers to one text per queried class.
 
     Attributes:
-        classes: (q,) int32.
-        precision: By k, (q,) float64 share of the k best instances (of all, if there are fewer) that are of the class; 0
-            where the map has none.
+        classes: (q,) int32 queried classes.
+        precision: By k, (q,) float64 share of the k best instances (of all, if there are fewer) that have the class; 0 if
+            the map has no instance.
         localisation_error_m: (q,) float64 distance of the best instance's centroid from the nearest centroid of a true
-            instance of the class; NaN where the map has none.
-        inside_box: (q,) float64, 1 where the best instance's centroid lies within the box of that true instance, else 0.
+            instance of the class; NaN if the map has no instance.
+        inside_box: (q,) float64, 1 if the best instance's centroid is in the box of that true instance, else 0.
     """
 
     classes: NDArray[np.int32]
@@ -53,7 +53,7 @@ class RetrievalScores:
 
 
 def true_objects(truth: VoxelTruth) -> TrueObjects:
-    """Where the true instances are."""
+    """Locate the true instances."""
     inside = truth.instances > 0
     ids, place = np.unique(truth.instances[inside], return_inverse=True)
     centers_m, classes = truth.centers_m[inside], truth.classes[inside]
@@ -71,11 +71,11 @@ def true_objects(truth: VoxelTruth) -> TrueObjects:
 def instance_scores(
     instance_of_voxel: NDArray[np.integer], cosines: NDArray[np.floating], count: int, min_voxels: int = 1
 ) -> NDArray[np.float64]:
-    """Score of each instance for each text: the mean over its voxels, as in a query.
+    """Compute the score of each instance for each text: the mean over its voxels, as in a query.
 
     Args:
         instance_of_voxel: (n,) instance that occupies each voxel of a layer, in 0 .. count - 1, or -1.
-        cosines: (n, c) of these voxels.
+        cosines: (n, c) cosines of these voxels.
         count: Number of instances.
         min_voxels: Instances with fewer of these voxels are not ranked.
 
@@ -93,7 +93,7 @@ def instance_scores(
 
 
 def majority_classes(instance_of_voxel: NDArray[np.integer], classes: NDArray[np.integer], count: int) -> NDArray[np.int32]:
-    """True class of most voxels that an instance covers, of those that have a class; ties: the lowest.
+    """Return the true class of most voxels that each instance covers, without unknown ones; ties go to the lowest.
 
     Args:
         instance_of_voxel: (n,) instance that covers each voxel of the truth, in 0 .. count - 1, or -1.
@@ -101,7 +101,7 @@ def majority_classes(instance_of_voxel: NDArray[np.integer], classes: NDArray[np
         count: Number of instances.
 
     Returns:
-        (count,) int32; 0 for an instance that covers unknown voxels only, NOWHERE for one that covers none.
+        (count,) int32; 0 for an instance that covers only unknown voxels, NOWHERE for one that covers no voxel.
     """
     covered = instance_of_voxel >= 0
     known = covered & (classes > 0)
@@ -118,19 +118,19 @@ def score_retrieval(
     classes: Sequence[int],
     ks: Sequence[int] = (1, 3, 5),
 ) -> RetrievalScores:
-    """Ask for each class that truly has an instance.
+    """Score the query for each class that has a true instance.
 
-    Instances of unknown class are not ranked, for nobody knows whether they are right; those that cover nothing true are,
-    and are wrong.
+    Instances of unknown class are not ranked, because they may be right or wrong. Instances that cover no voxel of the truth
+    are ranked, and are wrong.
 
     Args:
         scores: (count, c) of the map's instances for each class 1 .. c, NaN for those that are not ranked; ties: the lower
             place first.
-        instance_classes: (count,) as of :func:`majority_classes`.
+        instance_classes: (count,) true classes by :func:`majority_classes`.
         centroids_m: (count, 3) metres, map frame.
         objects: The true instances.
-        classes: What may be asked for; classes without a true instance are not.
-        ks: At which k precision is taken.
+        classes: Classes to query; those without a true instance are left out.
+        ks: Values of k for precision.
     """
     asked = [each for each in classes if np.any(objects.classes == each)]
     precision = {k: np.zeros(len(asked)) for k in ks}
@@ -153,13 +153,13 @@ def score_retrieval(
 
 
 def _most_frequent(groups: NDArray[np.integer], labels: NDArray[np.integer], count: int) -> NDArray[np.int32]:
-    """Most frequent label of each group, of equally frequent ones the lowest; 0 for a group without any."""
+    """Return the most frequent label of each group, 0 for an empty group; ties go to the lowest."""
     found = np.zeros(count, np.int32)
     if len(groups):
         width = int(labels.max()) + 1
         pairs, counts = np.unique(groups.astype(np.int64) * width + labels, return_counts=True)
         order = np.lexsort((-(pairs % width), counts, pairs // width))
-        # Of each group the last is written last: the highest count, and of equal ones the lowest label.
+        # In each group the last write wins: the highest count, with ties the lowest label.
         ends = np.flatnonzero(np.diff(pairs[order] // width, append=-1))
         found[pairs[order][ends] // width] = pairs[order][ends] % width
     return found

@@ -1,4 +1,4 @@
-"""How well classes are predicted voxel by voxel, and which classes are asked for."""
+"""Metrics of semantic segmentation over voxels, and the choice of evaluated classes."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from fus3dmaps_core.errors import MapError
 
 @dataclass(frozen=True)
 class ClassSubset:
-    """Some of the classes, with numbers of their own: 1 .. m in the order of their old ones.
+    """A choice of classes with new numbers 1 .. m, in the order of their old ones.
 
     Attributes:
-        names: (m,) their names, which are the prompts.
-        old_numbers: (m,) int32 number of each among all classes.
-        new_numbers: (c + 1,) int32 for all classes, nothing first: their number in here, 0 for those that are left out.
+        names: (m,) names of the classes, which are the prompts.
+        old_numbers: (m,) int32 old number of each class.
+        new_numbers: (c + 1,) int32 new number by old number, 0 for nothing and for classes left out.
     """
 
     names: tuple[str, ...]
@@ -27,11 +27,11 @@ class ClassSubset:
 
 
 def without_background(class_names: Sequence[str], background: Iterable[int]) -> ClassSubset:
-    """The classes that remain: ignored names are removed before prompting, and their numbers become 0.
+    """Leave out the background classes: their names are not prompted, and their numbers become 0.
 
     Args:
-        class_names: Name of each class; the first is of nothing and is never asked for.
-        background: Numbers of the classes that are left out; none leaves all in.
+        class_names: Name of each class; the first stands for nothing and is never queried.
+        background: Numbers of the classes to leave out; if empty, all remain.
 
     Raises:
         MapError: A number is not a class, or no class is left.
@@ -49,13 +49,13 @@ def without_background(class_names: Sequence[str], background: Iterable[int]) ->
 
 @dataclass(frozen=True)
 class SegmentationScores:
-    """Scores over the voxels that truly have a class.
+    """Scores over the voxels that have a true class.
 
     Attributes:
-        iou: (c,) float64 of classes 1 .. c, TP / (TP + FP + FN); NaN where the class does not occur (TP + FN = 0).
+        iou: (c,) float64 of classes 1 .. c, TP / (TP + FP + FN); NaN if the class does not occur (TP + FN = 0).
         miou: Mean over the classes that occur; NaN without any.
-        f_miou: Mean over these, weighted by how often they occur.
-        accuracy: Share of voxels whose class is right; a voxel without a prediction is a miss.
+        f_miou: Mean over these, weighted by their frequency.
+        accuracy: Share of voxels with the right class; a voxel without a prediction counts as wrong.
         mean_accuracy: Mean of TP / (TP + FN) over the classes that occur.
     """
 
@@ -67,7 +67,7 @@ class SegmentationScores:
 
 
 def confusion(true: NDArray[np.integer], predicted: NDArray[np.integer], class_count: int) -> NDArray[np.int64]:
-    """How many voxels of each true class have each predicted one: (c + 1, c + 1) int64, nothing first.
+    """Count the voxels by true and predicted class: (c + 1, c + 1) int64, nothing first.
 
     Args:
         true: (n,) classes in 0 .. c.
@@ -88,10 +88,10 @@ def confusion(true: NDArray[np.integer], predicted: NDArray[np.integer], class_c
 
 
 def score_segmentation(true: NDArray[np.integer], predicted: NDArray[np.integer], class_count: int) -> SegmentationScores:
-    """Scores of a prediction, over the voxels with a true class.
+    """Score a prediction over the voxels with a true class.
 
     Args:
-        true: (n,) classes in 1 .. c; voxels of 0 are not looked at.
+        true: (n,) classes in 1 .. c; voxels of 0 are ignored.
         predicted: (n,) classes in 1 .. c, 0 for none.
         class_count: c.
 

@@ -1,6 +1,7 @@
-"""Models that several maps of the same frames share: each image is segmented and embedded once, whoever asks.
+"""Models that are shared by several maps of the same frames: each image is segmented and embedded only once.
 
-An image is known again by being the very same array, which the pipeline hands on where an image has the working resolution.
+An image is recognised if it is the same array object. The pipeline passes on the same object if it has the working
+resolution.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from fus3dmaps_core.segmenters.protocols import Segmenter
 
 
 def shared_trio(trio: EncoderTrio) -> EncoderTrio:
-    """The same trio, whose image encoders remember what they made of the newest image."""
+    """Wrap a trio such that its image encoders remember the results of the newest image."""
     return replace(trio, patch=_PatchesOnce(trio.patch), crop=_CropsOnce(trio.crop))
 
 
 def shared_segmenter(segmenter: Segmenter) -> Segmenter:
-    """The same segmenter, which remembers what it made of the newest image."""
+    """Wrap a segmenter such that it remembers the masks of the newest image."""
     return _MasksOnce(segmenter)
 
 
@@ -41,7 +42,7 @@ class _PatchesOnce:
 
 
 class _CropsOnce:
-    """Masks of one image may come in batches, or be left out: each is known by its box and its pixels."""
+    """A crop encoder that remembers the newest image's embeddings by the boxes and pixels of the masks."""
 
     def __init__(self, encoder: CropEncoder) -> None:
         self._encoder = encoder

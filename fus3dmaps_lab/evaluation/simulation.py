@@ -1,7 +1,7 @@
-"""The paper's claims on simulated buildings: one building a seed, mapped in every way that is compared.
+"""Test of the paper's claims on simulated buildings: one building per seed, mapped in every compared way.
 
-Everything here is a simulation: the numbers say how the map behaves under stated statistics of its encoders and its
-segmenter, not how well any real model does.
+Everything here is a simulation: the numbers say how the map behaves with stated statistics of encoders and segmenter, not
+how good any real model is.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_lab.evaluation.building_runs import BuildingRun, Variant
+from fus3dmaps_lab.evaluation.curves import UNFUSED
 from fus3dmaps_lab.evaluation.evaluate_map import INSTANCE_LAYERS, evaluate_map
 from fus3dmaps_lab.evaluation.ground_truth import voxel_truth
 from fus3dmaps_lab.evaluation.records import LAYERS, MODES, CurvePoint, Record
@@ -36,20 +37,20 @@ ASSOCIATIONS: dict[str, dict[str, Any]] = {
 
 @dataclass(frozen=True)
 class Study:
-    """What is built and compared for every seed.
+    """The building and the comparisons of every seed.
 
     Attributes:
-        storeys: Of the building.
-        rooms_per_storey: Of the building.
-        frames: Along the route; None takes as many as the rooms need.
-        statistics: Of the encoders; their ``variance_ratio`` is the lambda of what does not sweep it.
+        storeys: Number of storeys.
+        rooms_per_storey: Number of rooms on each storey.
+        frames: Number of frames along the route; None takes as many as the rooms need.
+        statistics: Statistics of the encoders; their ``variance_ratio`` is lambda unless it is swept.
         segmenter: Statistics of the segmenter.
-        window_radius_m: Of the modes with a window.
-        noise_ratios: R^D / R^I of each lambda sweep, one for each model of the noise.
-        lambdas: Where a sweep evaluates.
-        window_radii_m: Of the sweep over radii.
+        window_radius_m: Radius of the modes with a window.
+        noise_ratios: R^D / R^I of each lambda sweep; each is swept with both models of the noise.
+        lambdas: Values of a sweep.
+        window_radii_m: Radii of the sweep over radii.
         associations: Parameters of each way to associate, by its name.
-        settings: Parameters of every map that differ from the defaults; what is compared goes before them.
+        settings: Parameters of every map that differ from the defaults; compared parameters override them.
     """
 
     storeys: int = 1
@@ -71,9 +72,9 @@ def study_building(
     """Build, map and evaluate the building of one seed.
 
     Args:
-        study: What is compared.
-        seed: Of the building, the sensor and the simulated models.
-        on_progress: Called with the number of frames mapped, and of all.
+        study: The building and the comparisons.
+        seed: Seed of the building, the sensor and the simulated models.
+        on_progress: Called with the number of frames mapped and of all frames.
 
     Returns:
         Records of the three modes, and the points of the curves.
@@ -100,13 +101,13 @@ def study_building(
 
 
 def with_noise_ratio(statistics: EncoderStatistics, ratio: float) -> EncoderStatistics:
-    """The same statistics with another R^D / R^I; the product of the two stays."""
+    """Return the statistics with another R^D / R^I; the product of the two stays."""
     mean = float(np.sqrt(statistics.patch_variance * statistics.crop_variance))
     return replace(statistics, patch_variance=mean * ratio**0.5, crop_variance=mean / ratio**0.5)
 
 
 def _noise_models(statistics: EncoderStatistics) -> dict[str, EncoderStatistics]:
-    """Statistics by experiment. A single patch is as noisy in both; crops of counted observations are far less so."""
+    """Return statistics by experiment. Single patches are equally noisy in both; crops of counted observations far less."""
     counted = statistics.patch_variance * DENSE_SAMPLES
     return {
         "lambda": replace(statistics, noise_per="observation", patch_variance=counted, crop_variance=counted),
@@ -141,7 +142,7 @@ def _radius_name(radius_m: float) -> str:
 
 
 class _Judge:
-    """Compares maps with what the building truly is."""
+    """Compares maps with the ground truth of the building."""
 
     def __init__(self, building: SimulatedBuilding, voxel_size_m: float) -> None:
         truth, surface = building.truth, building.surface()
@@ -160,7 +161,7 @@ class _Judge:
 def _curves(
     study: Study, pipelines: Mapping[str, Pipeline], judge: _Judge
 ) -> Iterator[tuple[str, str, float, dict[str, float]]]:
-    """Experiment, curve, x and metrics of every point."""
+    """Yield experiment, curve, x and metrics of every point."""
     for experiment, ratio in product(_noise_models(study.statistics), study.noise_ratios):
         pipeline = pipelines[f"{experiment} {_ratio_name(ratio)}"]
         for value in study.lambdas:
@@ -178,7 +179,7 @@ def _curves(
             count = float(pipeline.semantic_map.instance_count)
             yield (
                 "association",
-                f"{name}" if layer == "fused_instances" else f"{name}, unfused",
+                name if layer == "fused_instances" else name + UNFUSED,
                 0.0,
                 {
                     **{name: value for name, value in metrics.items() if not name.startswith("iou")},

@@ -1,4 +1,4 @@
-"""Studies of several seeds at once, each in a process of its own."""
+"""Studies of several seeds in parallel, each in its own process."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from fus3dmaps_lab.evaluation.records import CurvePoint, Record
 from fus3dmaps_lab.evaluation.simulation import ASSOCIATIONS, Study, study_building
 
 MODES_ONLY = Study(rooms_per_storey=6, frames=300)
-"""The modes alone."""
+"""The study of the modes alone."""
 
 QUICK = Study(rooms_per_storey=4, frames=160)
-"""The modes alone, in a smaller building."""
+"""The study of the modes alone, in a smaller building."""
 
 WHOLE = replace(
     MODES_ONLY, noise_ratios=(0.2, 1.0, 5.0), window_radii_m=(1.5, 3.0, 4.5, 6.0, 9.0), associations=ASSOCIATIONS
 )
-"""Modes and all sweeps."""
+"""The study of the modes and all sweeps."""
 
 _POLL_S = 0.2
 
@@ -36,13 +36,13 @@ def study_seeds(
     """Study one building for each seed.
 
     Args:
-        study: What is built and compared.
-        seeds: Of the buildings.
-        jobs: How many are studied at once; 0 for as many as there are processors. The results are the same.
-        on_progress: Called with the number of frames mapped, and of all.
+        study: The building and the comparisons.
+        seeds: Seeds of the buildings.
+        jobs: Number of parallel processes; 0 takes one per processor. It does not change the results.
+        on_progress: Called with the number of frames mapped and of all frames.
 
     Returns:
-        Records and points of curves, in the order of seeds.
+        Records and curve points, in the order of seeds.
     """
     results = _each(study_building, [(study, seed) for seed in seeds], jobs, on_progress)
     return [each for records, _ in results for each in records], [each for _, points in results for each in points]
@@ -51,13 +51,13 @@ def study_seeds(
 def memory_of(
     study: MemoryStudy, seeds: Sequence[int], jobs: int = 1, on_progress: Progress | None = None
 ) -> list[CurvePoint]:
-    """Points of the memory experiment for each seed; one at a time by default, for a map may take gigabytes.
+    """Run the memory experiment for each seed, by default one at a time, because a map may take gigabytes.
 
     Args:
-        study: What is built.
-        seeds: Of the buildings.
+        study: The building.
+        seeds: Seeds of the buildings.
         jobs: As in :func:`study_seeds`.
-        on_progress: As there.
+        on_progress: As in :func:`study_seeds`.
     """
     return [
         point for points in _each(memory_curves, [(study, seed) for seed in seeds], jobs, on_progress) for point in points
@@ -67,7 +67,7 @@ def memory_of(
 def _each(
     work: Callable[..., Any], arguments: Sequence[tuple[Any, ...]], jobs: int, on_progress: Progress | None
 ) -> list[Any]:
-    """Results of calls in processes of their own, in order."""
+    """Call a function in parallel processes and return the results in order."""
     context = multiprocessing.get_context("spawn")  # Threads of torch and numba do not survive a fork.
     with context.Manager() as manager:
         messages = manager.Queue()
@@ -84,7 +84,7 @@ def _follow(futures: list[Future[Any]], messages: Any, on_progress: Progress | N
     while pending:
         done, pending = wait(pending, _POLL_S, FIRST_COMPLETED)
         for future in done:
-            future.result()  # The first failure ends it all.
+            future.result()  # The first failure ends all of them.
         try:
             while True:
                 place, frames, total = messages.get_nowait()

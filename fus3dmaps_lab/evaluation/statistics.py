@@ -1,7 +1,7 @@
 """Mean, spread and paired comparison of one metric over seeds and scenes.
 
-The spread is the sample standard deviation (divisor n - 1). All tests are two-sided. With five pairs the signed-rank and the
-sign test cannot go below p = 0.0625, whatever the data; the t-test can.
+The spread is the sample standard deviation (divisor n - 1). All tests are two-sided. With five pairs, the signed-rank test
+and the sign test never give less than p = 0.0625; the t-test can.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ from scipy import stats
 from fus3dmaps_core.errors import Fus3dmapsError
 
 Unit = tuple[str, int]
-"""What a comparison pairs by: scene and seed."""
+"""The unit by which comparisons are paired: scene and seed."""
 
 _ROUNDING = 1e-12
 
 
 class ComparisonError(Fus3dmapsError):
-    """Results cannot be compared: some are missing, undefined or given twice."""
+    """Results that cannot be compared: some are missing, undefined or given twice."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """How values are spread.
+    """Mean and spread of values.
 
     Attributes:
-        count: How many are defined.
-        mean: Of those; NaN without any.
+        count: Number of defined values.
+        mean: Their mean; NaN without any.
         std: Sample standard deviation; NaN with fewer than two.
-        minimum: Smallest; NaN without any.
-        maximum: Largest; NaN without any.
-        undefined: How many were NaN and are left out of all the others.
+        minimum: Smallest value; NaN without any.
+        maximum: Largest value; NaN without any.
+        undefined: Number of NaNs, which are left out of everything else.
     """
 
     count: int
@@ -48,17 +48,17 @@ class Spread:
 
 @dataclass(frozen=True)
 class PairedComparison:
-    """A second condition against a first one, pair by pair.
+    """Comparison of a second condition with a first one, pair by pair.
 
     Attributes:
-        differences: Second minus first by unit, in the units' order.
+        differences: Second minus first, by unit in ascending order.
         first: Spread of the first condition's values.
         second: Spread of the second condition's values.
         difference: Spread of the differences.
-        better: In how many pairs the second is greater.
-        worse: In how many it is smaller.
-        t_p: p of the paired t-test; NaN with fewer than two pairs or where all differences are equal.
-        wilcoxon_p: p of the signed-rank test, pairs without a difference left out; 1 where none has one.
+        better: Number of pairs in which the second is greater.
+        worse: Number of pairs in which it is smaller.
+        t_p: p of the paired t-test; NaN with fewer than two pairs or if all differences are equal.
+        wilcoxon_p: p of the signed-rank test without pairs of equal values; 1 if all are equal.
         sign_p: p of the sign test, likewise.
     """
 
@@ -79,7 +79,7 @@ class PairedComparison:
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Mean, standard deviation and range of the values that are defined."""
+    """Compute mean, standard deviation and range of the values that are not NaN."""
     everything = np.fromiter(values, np.float64)
     defined = everything[~np.isnan(everything)]
     if not defined.size:
@@ -100,12 +100,12 @@ def compare(
     """Compare two conditions that were measured on the same scenes and seeds.
 
     Args:
-        first: Value by scene and seed.
-        second: The same for the other condition.
-        names: What the two are called in a refusal.
+        first: Values of the first condition by scene and seed.
+        second: Values of the second condition by scene and seed.
+        names: Names of the two in error messages.
 
     Raises:
-        ComparisonError: A unit is in one of them only, a value is NaN or infinite, or there is none.
+        ComparisonError: A unit is only in one of them, a value is NaN or infinite, or there is no value.
     """
     conditions = ((names[0], first, names[1], second), (names[1], second, names[0], first))
     for name, values, other, others in conditions:
@@ -117,7 +117,7 @@ def compare(
         raise ComparisonError(f"neither {names[0]} nor {names[1]} has any result")
     units = sorted(first)
     differences = np.array([second[unit] - first[unit] for unit in units])
-    # What differs by rounding alone is equal: a sum in another order must not decide a sign.
+    # Values that differ only by rounding are equal: the order of a sum must not decide a sign.
     size = np.array([max(abs(first[unit]), abs(second[unit])) for unit in units])
     differences[np.abs(differences) <= _ROUNDING * size] = 0.0
     better, worse = int((differences > 0).sum()), int((differences < 0).sum())
@@ -135,12 +135,12 @@ def compare(
 
 
 def kept(comparison: PairedComparison) -> float:
-    """Share of the first condition's mean that the second keeps, in percent; NaN where the first mean is 0."""
+    """Compute the share of the first condition's mean that the second keeps, percent; NaN if the first mean is 0."""
     return 100.0 * comparison.second.mean / comparison.first.mean if comparison.first.mean else math.nan
 
 
 def named(units: Iterable[Unit]) -> str:
-    """Scenes with their seeds, for a message: ``building seeds 1, 3; room0 seed 0``."""
+    """Name scenes with their seeds for a message: ``building seeds 1, 3; room0 seed 0``."""
     by_scene: dict[str, list[int]] = {}
     for scene, seed in sorted(units):
         by_scene.setdefault(scene, []).append(seed)

@@ -1,7 +1,7 @@
 """Tables of an evaluation, written as Markdown for people and as CSV for programs.
 
-In Markdown a cell with a spread reads ``mean ± standard deviation``; in CSV its column becomes five. CSV text is quoted and
-numbers are not, in full precision, so that ``csv.QUOTE_NONNUMERIC`` reads back what was written; what is missing is ``nan``.
+In Markdown a cell with a spread reads ``mean ± standard deviation``; in CSV its column becomes five. In CSV, text is quoted,
+numbers have full precision and no quotes, and missing numbers are ``nan``, so ``csv.QUOTE_NONNUMERIC`` reads it back.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from fus3dmaps_lab.evaluation.statistics import ComparisonError, PairedCompariso
 Cell = str | int | float | Spread
 
 ALL_SCENES = "all scenes"
-"""Stands for the scene where several are averaged."""
+"""Name of the scene in averages over several scenes."""
 
 _MISSING = "–"
 _SPREAD_PARTS = ("mean", "std", "min", "max", "n")
@@ -32,7 +32,7 @@ class Column:
     """A column of a table.
 
     Attributes:
-        name: Its heading, with the unit where there is one.
+        name: Heading, with the unit if there is one.
         form: Format of its numbers in Markdown.
     """
 
@@ -45,8 +45,8 @@ class Table:
     """Rows under named columns.
 
     Attributes:
-        columns: Headings.
-        rows: One cell a column; numbers that are missing are NaN, spreads of nothing have count 0.
+        columns: The columns.
+        rows: Rows with one cell per column; missing numbers are NaN, missing spreads have count 0.
     """
 
     columns: tuple[Column, ...]
@@ -58,7 +58,7 @@ class Table:
                 raise ValueError(f"a row of {len(row)} cells under {len(self.columns)} columns")
 
     def markdown(self) -> str:
-        """The table as GitHub writes it, numbers right-aligned; a line break ends every line."""
+        """Format the table as GitHub Markdown, numbers right-aligned; every line ends in a line break."""
         numeric = [any(not isinstance(row[i], str) for row in self.rows) for i in range(len(self.columns))]
         lines = [
             [_escaped(column.name) for column in self.columns],
@@ -68,7 +68,7 @@ class Table:
         return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
     def csv(self) -> str:
-        """The table with a heading line, spreads as mean, std, min, max and n."""
+        """Format the table as CSV with a heading line; spreads become mean, std, min, max and n."""
         spreads = [any(isinstance(row[i], Spread) for row in self.rows) for i in range(len(self.columns))]
         stream = io.StringIO()
         writer = csv.writer(stream, quoting=csv.QUOTE_NONNUMERIC, lineterminator="\n")
@@ -91,7 +91,7 @@ _TEST_COLUMNS = (
 
 
 def records_table(records: Iterable[Record]) -> Table:
-    """Every record, a row each, IoUs of classes among them, in a fixed order."""
+    """List every record in a row, with IoUs of classes, in a fixed order."""
     rows = sorted((r.scene, r.seed, _rank(LAYERS, r.layer), _rank(MODES, r.mode), r.metric, r.value) for r in records)
     columns = ("scene", "seed", "layer", "mode", "metric", "value")
     return Table(
@@ -101,7 +101,7 @@ def records_table(records: Iterable[Record]) -> Table:
 
 
 def scores_table(records: Sequence[Record], metrics: Sequence[str] | None = None) -> Table:
-    """One row for every scene, seed, layer and mode, one column for every metric (without: all that occur but classes')."""
+    """List the scores: a row per scene, seed, layer and mode, a column per metric (default: all but classes')."""
     names = tuple(metrics if metrics is not None else metrics_in(records))
     rows: list[tuple[Cell, ...]] = []
     by_condition = {
@@ -117,7 +117,7 @@ def scores_table(records: Sequence[Record], metrics: Sequence[str] | None = None
 
 
 def summary_table(records: Sequence[Record], metrics: Sequence[str] | None = None) -> Table:
-    """Mean and spread over seeds for every scene, layer and mode, and over all scenes where there are several."""
+    """Summarise by scene, layer and mode: mean and spread over seeds, and over all scenes if there are several."""
     names = tuple(metrics if metrics is not None else metrics_in(records))
     scenes = sorted({record.scene for record in records})
     rows: list[tuple[Cell, ...]] = []
@@ -134,7 +134,7 @@ def summary_table(records: Sequence[Record], metrics: Sequence[str] | None = Non
 
 
 def metrics_table(records: Sequence[Record], metrics: Sequence[str]) -> Table:
-    """Mean and spread over scenes and seeds, a row for every metric and a column for every layer and mode."""
+    """Summarise over scenes and seeds: mean and spread, a row per metric, a column per layer and mode."""
     conditions = conditions_in(records)
     rows: list[tuple[Cell, ...]] = [
         (metric, *(spread(values_of(records, condition, metric).values()) for condition in conditions)) for metric in metrics
@@ -143,10 +143,10 @@ def metrics_table(records: Sequence[Record], metrics: Sequence[str]) -> Table:
 
 
 def comparison_table(records: Sequence[Record], metrics: Sequence[str]) -> tuple[Table, list[str]]:
-    """Paired tests of every effect in every metric.
+    """Run the paired tests of every effect in every metric.
 
     Returns:
-        The table, and why what could not be compared was refused.
+        The table, and the reasons for comparisons that were not possible.
     """
     rows: list[tuple[Cell, ...]] = []
     refusals: list[str] = []
@@ -163,7 +163,7 @@ def comparison_table(records: Sequence[Record], metrics: Sequence[str]) -> tuple
 
 
 def options_table(points: Sequence[CurvePoint]) -> Table:
-    """Mean and spread over seeds of an experiment whose curves are options: a row for every metric, a column for each."""
+    """Summarise an experiment of options: mean and spread over seeds, a row per metric, a column per option."""
     curves = list(dict.fromkeys(point.curve for point in points))
     rows: list[tuple[Cell, ...]] = [
         (metric, *(spread(p.value for p in points if (p.curve, p.metric) == (curve, metric)) for curve in curves))
@@ -173,14 +173,14 @@ def options_table(points: Sequence[CurvePoint]) -> Table:
 
 
 def options_tests_table(points: Sequence[CurvePoint], metrics: Sequence[str]) -> tuple[Table, list[str]]:
-    """Paired tests of every option against the first one, fused against fused and unfused against unfused.
+    """Run paired tests of every option against the first one, fused against fused and unfused against unfused.
 
     Args:
-        points: Of one experiment whose curves are options, see :func:`fus3dmaps_lab.evaluation.curves.option_of`.
-        metrics: Those compared, as far as they were measured.
+        points: Points of one experiment whose curves are options, see :func:`fus3dmaps_lab.evaluation.curves.option_of`.
+        metrics: Compared metrics, if they were measured.
 
     Returns:
-        The table, and why what could not be compared was refused.
+        The table, and the reasons for comparisons that were not possible.
     """
     rows: list[tuple[Cell, ...]] = []
     refusals: list[str] = []
@@ -205,10 +205,10 @@ def options_tests_table(points: Sequence[CurvePoint], metrics: Sequence[str]) ->
 
 
 def curve_table(points: Sequence[CurvePoint], x_name: str) -> Table:
-    """Mean and spread over seeds of one experiment: a row for every curve and x, a column for every metric.
+    """Summarise one experiment: mean and spread over seeds, a row per curve and x, a column per metric.
 
     Args:
-        points: Of one experiment.
+        points: Points of one experiment.
         x_name: Heading of x, with its unit.
     """
     metrics = sorted({point.metric for point in points}, key=_metric_rank)
@@ -226,26 +226,26 @@ def curve_table(points: Sequence[CurvePoint], x_name: str) -> Table:
 
 
 def points_table(points: Iterable[CurvePoint]) -> Table:
-    """Every point of every curve, a row each."""
+    """List every point of every curve in a row."""
     columns = ("experiment", "curve", "seed", "x", "metric", "value")
     rows = sorted((p.experiment, p.curve, p.seed, p.x, p.metric, p.value) for p in points)
     return Table(tuple(Column(name) for name in columns), tuple(rows))
 
 
 def conditions_in(records: Iterable[Record]) -> list[Condition]:
-    """Layers and modes that occur, in the records' order of layers, then of modes."""
+    """List the layers and modes that occur, in the order of LAYERS, then of MODES."""
     present = {(record.layer, record.mode) for record in records}
     ordered = sorted((_rank(LAYERS, layer), _rank(MODES, mode)) for layer, mode in present)
     return [Condition(layer, mode) for (_, layer), (_, mode) in ordered]
 
 
 def metric_form(metric: str) -> str:
-    """Format of a metric's numbers: whole ones for counts and bytes."""
+    """Return the format of a metric's numbers: whole numbers for counts and bytes."""
     return ",.0f" if metric in ("bytes", "instances", "voxels") else ".4f"
 
 
 def _tests(found: PairedComparison) -> tuple[Cell, ...]:
-    """Cells under _TEST_COLUMNS."""
+    """Make the cells under _TEST_COLUMNS."""
     return (
         *(found.first, found.second, found.difference, kept(found), f"{found.better} of {found.count}"),
         *(found.t_p, found.wilcoxon_p, found.sign_p),

@@ -1,7 +1,7 @@
-"""Whether the paper's claims hold in the data at hand, computed and put into words with the numbers that decide.
+"""Verdicts on whether the paper's claims hold in the data, in words with the deciding numbers.
 
-A claim about two maps holds if it is true in every pair of at least five, or by a paired t-test at p < 0.01. What rests on
-means over seeds needs five as well; memory, which no seed decides, does not.
+A claim about two maps holds if it is true in all of at least five pairs, or by a paired t-test at p < 0.01. Claims about
+means over seeds need five seeds too; claims about memory do not.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from fus3dmaps_lab.evaluation.records import CurvePoint, Record
 from fus3dmaps_lab.evaluation.statistics import ComparisonError, PairedComparison, kept, spread
 
 LEAST_PAIRS = 5
-"""Fewer pairs decide nothing."""
+"""Least number of pairs for a decision."""
 
 SIGNIFICANT_P = 0.01
-"""Below it a paired t-test decides."""
+"""A paired t-test decides if its p is below this."""
 
 LEAST_KEPT_PERCENT = 98.0
-"""What a sliding window must keep of full fusion's mIoU."""
+"""Share of full fusion's mIoU that a sliding window must keep."""
 
 SLOPE_TOLERANCE = 0.05
-"""By what share the measured bytes per volume may differ from the predicted ones."""
+"""Greatest relative difference between measured and predicted bytes per volume."""
 
 LEAST_LINEARITY = 0.99
-"""Least coefficient of determination of memory that is called linear in volume."""
+"""Least coefficient of determination for memory to be called linear in volume."""
 
 FAR_BELOW = 0.5
-"""A window's memory, as a share of the dense map's at the largest volume, that is still far below it."""
+"""Greatest share of the dense map's memory, at the largest volume, that counts as far below it."""
 
 GREATER_IS_BETTER = ("mIoU", "f-mIoU", "accuracy", "mean_accuracy", "AP25", "AP50", "precision@1", "localised")
 """Metrics by which ways to associate are ranked."""
@@ -49,12 +49,12 @@ _WORDS = {True: "holds", False: "does not hold", None: "undecided"}
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the data say of one claim.
+    """The verdict of the data on one claim.
 
     Attributes:
-        claim: In words.
-        holds: True, False, or None where the data do not decide.
-        numbers: What it rests on, in words.
+        claim: The claim in words.
+        holds: True, False, or None if the data do not decide.
+        numbers: The deciding numbers, in words.
     """
 
     claim: str
@@ -66,11 +66,11 @@ class Verdict:
 
 
 def effect_verdicts(records: Sequence[Record], metric: str = "mIoU") -> list[Verdict]:
-    """Verdicts on the four claims that compare two maps, those without data left out.
+    """Judge the four claims that compare two maps; leave out those without data.
 
     Args:
-        records: Of one group, so that simulated and recorded scenes are never averaged.
-        metric: What is compared.
+        records: Records of one group, so that simulated and recorded scenes are never averaged.
+        metric: Compared metric.
     """
     claims: tuple[tuple[Effect, str], ...] = (
         (FUSED_INSTANCES, f"fused instances beat unfused instances in {metric}"),
@@ -91,7 +91,7 @@ def effect_verdicts(records: Sequence[Record], metric: str = "mIoU") -> list[Ver
 
 
 def lambda_verdict(points: Sequence[CurvePoint], metric: str = "mIoU") -> Verdict | None:
-    """Whether the best lambda brackets R^D / R^I for every noise ratio, of at least three; None without a sweep."""
+    """Judge whether the best lambda brackets R^D / R^I at all of at least three noise ratios; None without a sweep."""
     optima = lambda_optima(points, metric)
     if not optima:
         return None
@@ -109,14 +109,14 @@ def lambda_verdict(points: Sequence[CurvePoint], metric: str = "mIoU") -> Verdic
 
 
 def memory_verdicts(points: Sequence[CurvePoint]) -> list[Verdict]:
-    """Whether the dense map's memory is linear in volume, with the predicted slope, and the window's far below it.
+    """Judge whether the dense map's memory is linear in volume with the predicted slope, and the window's far below it.
 
     Args:
-        points: Of the experiment ``memory``.
+        points: Points of the experiment ``memory``.
     """
     verdicts = []
     dense, predicted = line_of(points, DENSE_MAP), line_of(points, PREDICTED)
-    if dense and dense.volumes >= 3:  # Two points are always on a line.
+    if dense and dense.volumes >= 3:  # Two points always lie on a line.
         said = f"{dense.slope:,.0f} bytes per m³ up to {dense.largest_x:,.0f} m³, R² = {dense.linearity:.4f}"
         holds = None if dense.linearity >= LEAST_LINEARITY else False
         if predicted:
@@ -139,10 +139,10 @@ def memory_verdicts(points: Sequence[CurvePoint]) -> list[Verdict]:
 
 
 def association_verdict(points: Sequence[CurvePoint]) -> Verdict | None:
-    """Whether one way to associate is the best by every metric, fused and unfused; None with fewer than two ways.
+    """Judge whether one way to associate is best by every metric, fused and unfused; None with fewer than two ways.
 
     Args:
-        points: Of the experiment ``association``.
+        points: Points of the experiment ``association``.
     """
     winners, said = set(), []
     for fused in (True, False):

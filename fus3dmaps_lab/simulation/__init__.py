@@ -1,1 +1,1 @@
-"""Simulated places: textured scenes, a renderer, camera paths and a depth sensor's noise."""
+"""Simulated rooms and buildings, a depth sensor, a drifting robot, and models that err with stated statistics."""

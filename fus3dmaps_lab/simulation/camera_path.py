@@ -1,4 +1,4 @@
-"""Smooth paths of a camera that looks at things, paced like a robot that neither jumps nor spins."""
+"""Smooth camera paths past things to look at, at the even pace of a robot."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _RESOLUTION = 2000
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A stop of the path.
+    """A point of the path with the camera's viewing direction there.
 
     Attributes:
-        position_m: Where the camera is.
-        target_m: What it looks at.
+        position_m: Position of the camera.
+        target_m: Point that it looks at.
     """
 
     position_m: tuple[float, float, float]
@@ -27,7 +27,7 @@ class Viewpoint:
 
 
 def look_at(position_m: ArrayLike, target_m: ArrayLike) -> NDArray[np.float64]:
-    """(4, 4) pose of an upright optical frame (x right, y down, z forward) that looks from one point at another.
+    """Return the (4, 4) pose of an upright optical frame (x right, y down, z forward) that looks at a target.
 
     Raises:
         ValueError: The points coincide or lie above one another.
@@ -46,9 +46,9 @@ def look_at(position_m: ArrayLike, target_m: ArrayLike) -> NDArray[np.float64]:
 
 
 class CameraPath:
-    """A closed path through viewpoints; the camera's speed in metres and in turning is evened out over it.
+    """A closed path through viewpoints, on which the camera moves and turns at an even speed.
 
-    Positions and viewing directions follow periodic cubic splines (C2), so the target of a viewpoint is met exactly there.
+    Positions and viewing directions follow periodic cubic splines (C2), which pass exactly through the viewpoints.
     """
 
     def __init__(self, viewpoints: Sequence[Viewpoint], metres_per_radian: float = 1.0) -> None:
@@ -56,7 +56,7 @@ class CameraPath:
 
         Args:
             viewpoints: At least three, in order; the path returns to the first.
-            metres_per_radian: How many metres of travel take the time of one radian of turning.
+            metres_per_radian: Metres of travel that take as long as one radian of turning.
 
         Raises:
             ValueError: There are fewer than three viewpoints.
@@ -82,7 +82,7 @@ class CameraPath:
         self._progress = np.concatenate([[0.0], np.cumsum(step)]) / step.sum()
 
     def pose(self, progress: float) -> NDArray[np.float64]:
-        """(4, 4) pose of the optical frame after a share of the path; 0 and 1 are the same place."""
+        """Return the (4, 4) pose of the optical frame after a share of the path; 0 and 1 are the same place."""
         at = np.interp(progress, self._progress, self._parameter)
         position = self._position(at)
         return look_at(position, position + self._gaze(at))

@@ -1,4 +1,4 @@
-"""What a depth camera makes of true depth: quantised noisy disparity, ragged edges, holes."""
+"""Simulation of a depth camera: noise and steps of disparity, ragged edges, holes."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 class DepthSensor:
     """A structured-light or stereo depth camera.
 
-    Disparity d = focal_baseline / z gets Gaussian noise and is rounded to steps, so that the error of depth grows with its
-    square: sigma_z = z^2 / focal_baseline * sqrt(disparity_sigma^2 + disparity_step^2 / 12). The defaults are a Kinect's
-    (580 px, 75 mm, eighths of a pixel), which come to 1.4 mm at 1 m and 13 mm at 3 m.
+    Disparity d = focal_baseline / z gets Gaussian noise and is rounded to steps, so the error of depth grows with the square
+    of depth: sigma_z = z^2 / focal_baseline * sqrt(disparity_sigma^2 + disparity_step^2 / 12). The defaults are
+    those of a Kinect (580 px, 75 mm, eighths of a pixel) and give 1.4 mm at 1 m and 13 mm at 3 m.
 
     Attributes:
         focal_baseline_m_px: Focal length times baseline, metres times pixels.
         disparity_sigma_px: Noise of the matched disparity, pixels.
         disparity_step_px: Steps of disparity, pixels.
-        lateral_sigma_px: How far a reading strays sideways, pixels of the image; it frays the edges of things.
+        lateral_sigma_px: Sideways shift of a reading, pixels of the image; it frays the edges of things.
         edge_step_px: Disparity step between neighbours that counts as an edge of depth.
         edge_dropout: Share of readings lost at such edges.
-        grazing_from_rad: Angle between ray and surface normal from which readings get lost ...
-        grazing_to_rad: ... and from which all of them are, with a straight line of probability between.
+        grazing_from_rad: Angle between ray and surface normal above which readings begin to be lost.
+        grazing_to_rad: Angle above which all readings are lost; the probability rises linearly in between.
         random_dropout: Share of readings lost anywhere.
-        min_m: Nearer surfaces give no reading.
-        max_m: Farther surfaces give no reading.
+        min_m: Least depth that is read.
+        max_m: Greatest depth that is read.
     """
 
     focal_baseline_m_px: float = 43.5
@@ -43,20 +43,15 @@ class DepthSensor:
     min_m: float = 0.4
     max_m: float = 8.0
 
-    def sigma_m(self, depth_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Standard deviation of a reading on a surface that faces the camera, metres."""
-        spread_px = float(np.hypot(self.disparity_sigma_px, self.disparity_step_px / np.sqrt(12)))
-        return np.asarray(depth_m, np.float64) ** 2 * (spread_px / self.focal_baseline_m_px)
-
     def measure(
         self, depth_m: NDArray[np.float32], incidence_cos: NDArray[np.float32], rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """Readings of one view.
+        """Simulate the readings of one view.
 
         Args:
             depth_m: (H, W) true depth along the optical axis, metres; 0 where there is nothing.
             incidence_cos: (H, W) cosine between ray and surface normal.
-            rng: The only source of chance.
+            rng: Source of all random numbers.
 
         Returns:
             (H, W) metres; 0 where there is no reading.

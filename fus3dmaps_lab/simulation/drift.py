@@ -1,4 +1,4 @@
-"""What odometry makes of a way: the pose that a robot believes strays from the true one as it moves and turns."""
+"""Simulation of odometry: the estimated pose drifts away from the true one as the robot moves and turns."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Drift:
-    """A random walk.
+    """A random walk of the pose.
 
     Attributes:
-        position_sigma_m: Standard deviation along each axis of the world after one metre of way; it grows with the square
-            root of the way.
-        yaw_sigma_rad: Standard deviation of the heading after one radian of turning and one metre of way, likewise.
-        seed: Of the walk.
+        position_sigma_m: Standard deviation along each axis of the world after one metre; it grows with the square root of
+            the distance.
+        yaw_sigma_rad: Standard deviation of the heading, which grows with the square root of metres plus radians turned.
+        seed: Seed of the random walk.
     """
 
     position_sigma_m: float = 0.005
@@ -24,13 +24,13 @@ class Drift:
     seed: int = 0
 
     def believed(self, poses: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Poses that a robot believes, which start from the true one.
+        """Add drift to true poses; the first pose stays as it is.
 
         Args:
             poses: (n, 4, 4) true poses T_world_camera in order of time.
 
         Returns:
-            (n, 4, 4) believed ones.
+            (n, 4, 4) poses that the robot believes.
         """
         rng = np.random.default_rng((self.seed, 0xD81F7))
         believed = poses.copy()

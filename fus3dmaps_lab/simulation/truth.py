@@ -1,4 +1,4 @@
-"""What is truly in a simulated world: classes, instances and parts, per pixel and per surface point."""
+"""Ground truth of a simulated world: classes, instances and parts, per pixel and per surface point."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ NOTHING = 0
 
 @dataclass(frozen=True)
 class Truth:
-    """A hierarchy of parts, instances and classes; each is counted from 1, and 0 is nothing.
+    """The parts, instances and classes of a world. Each is numbered from 1; 0 is nothing.
 
-    A wall is an instance too, of a background class; a thing without parts is its only part.
+    A part belongs to an instance, and an instance to a class. A wall is an instance too, of a background class. A thing
+    without parts has itself as its only part.
 
     Attributes:
         class_names: Name of each class; the first is empty and stands for nothing.
-        background: Classes of the building itself, e.g. wall and floor, by number.
+        background: Numbers of the classes of the building itself, such as wall and floor.
         class_of_instance: (instances + 1,) int32, 0 first.
         instance_of_part: (parts + 1,) int32, 0 first.
     """
@@ -33,19 +34,19 @@ class Truth:
 
     @property
     def class_of_part(self) -> NDArray[np.int32]:
-        """(parts + 1,) int32, 0 first."""
+        """Class of each part: (parts + 1,) int32, 0 first."""
         return self.class_of_instance[self.instance_of_part]
 
 
 @dataclass(frozen=True)
 class LabelledFrame:
-    """A frame as the robot has it, and what it truly shows.
+    """A frame as the robot records it, and its ground truth.
 
     Attributes:
-        frame: Noisy depth, and the pose that the robot believes.
+        frame: The frame with noisy depth and the pose that the robot believes.
         T_true_camera: (4, 4) true pose of the optical frame in the world.
         true_depth_m: (H, W) float32 metres along the optical axis, 0 where there is nothing.
-        parts: (H, W) int32, part seen by each pixel of the colour image, 0 for none.
+        parts: (H, W) int32, part at each pixel of the colour image, 0 for none.
     """
 
     frame: PosedFrame
@@ -56,11 +57,11 @@ class LabelledFrame:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Samples of all surfaces of a world.
+    """Sample points of all surfaces of a world.
 
     Attributes:
         points_m: (n, 3) float64, metres.
-        parts: (n,) int32, part that each lies on.
+        parts: (n,) int32, part of each point.
     """
 
     points_m: NDArray[np.float64]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import torch
 from rclpy.node import Node
@@ -11,26 +10,18 @@ from rclpy.node import Node
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.health.diagnosis import Diagnosis, MapSizes
-from fus3dmaps_core.health.input_problems import Problem, Stream
+from fus3dmaps_core.health.input_problems import Problem
 from fus3dmaps_core.health.mapping_problems import MIB, MemoryState
 from fus3dmaps_core.sources.paired import PairedMessages
-from fus3dmaps_core.sources.streams import InputStream, pose_topic
+from fus3dmaps_core.sources.streams import Stream, pose_topic
 from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.reporting.diagnostics import Diagnostics, publishers_of
-from fus3dmaps_ros.topics.inputs import input_qos
-
-_ROLES: dict[str, Literal["rgb", "depth", "camera_info"]] = {
-    "input.rgb_topic": "rgb",
-    "input.depth_topic": "depth",
-    "input.camera_info_topic": "camera_info",
-    "input.depth_camera_info_topic": "camera_info",
-}
 
 
 class Watch:
     """From activation to deactivation: follows inputs and frames, and publishes ``/diagnostics``."""
 
-    def __init__(self, node: Node, config: Config, streams: Sequence[InputStream], session: Session) -> None:
+    def __init__(self, node: Node, config: Config, streams: Sequence[Stream], session: Session) -> None:
         """Begin to watch.
 
         Args:
@@ -45,7 +36,7 @@ class Watch:
         self._topics = [stream.topic for stream in streams]
         self._cameras: dict[str, object] = {}
         self.diagnosis = Diagnosis(
-            [_stream(stream) for stream in streams],
+            streams,
             sync_tolerance_s=config.input.sync_tolerance_s,
             max_wait_s=config.input.max_wait_s,
             use_sim_time=bool(node.get_parameter("use_sim_time").value),
@@ -112,17 +103,3 @@ class Watch:
     def _sizes(self) -> MapSizes:
         semantic_map = self._session.pipeline.semantic_map
         return MapSizes(semantic_map.voxel_count, semantic_map.instance_count, semantic_map.nbytes())
-
-
-def _stream(stream: InputStream) -> Stream:
-    qos = input_qos(stream.qos, 1)
-    role: Literal["rgb", "depth", "camera_info", "pose"] = _ROLES.get(stream.parameter, "pose")
-    return Stream(
-        stream.topic,
-        role,
-        qos.reliability.name,
-        qos.durability.name,
-        topic_parameter=stream.parameter,
-        qos_parameter=f"input.{role}_qos",
-        once=role == "camera_info",
-    )

@@ -18,7 +18,7 @@ from fus3dmaps_core.answers.query import (
     embed_image,
 )
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages.images import decode_color
 from fus3dmaps_msgs.srv import LabelMap, ListInstances, QueryImage, QueryText
 from fus3dmaps_ros.node.session import SessionHolder
 from fus3dmaps_ros.node.timed_calls import between_frames
@@ -61,7 +61,7 @@ class QueryServices(ServiceGroup):
         session = self._sessions.require()
         query = self._query(request, [IMAGE_PROMPT])
         query.check()
-        rgb = messages.decode_color(request.image, "image")
+        rgb = decode_color(request.image, "image")
         # By the mapping thread: its encoder need not be thread-safe, and a second copy would not fit the GPU.
         crop = session.pipeline.trio.crop
         encoded = session.worker.between_frames(lambda: embed_image(crop, rgb), changes=False)

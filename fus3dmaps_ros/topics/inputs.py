@@ -19,7 +19,7 @@ from fus3dmaps_core.config.input import QosProfile
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.messages.fields import stamp_ns
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
-from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_core.sources.streams import QOS_PROFILES, Stream, uses_tf
 from fus3dmaps_ros.node.drops import DropLog
 from fus3dmaps_ros.topics.tf_poses import TfListener
 
@@ -30,12 +30,6 @@ _TYPES: dict[str, type[Any]] = {
     "geometry_msgs/msg/PoseStamped": PoseStamped,
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
     "nav_msgs/msg/Odometry": Odometry,
-}
-_POLICIES: dict[QosProfile, tuple[ReliabilityPolicy, DurabilityPolicy]] = {
-    "sensor_data": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    "reliable": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    "transient_local": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    "best_available": (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE),
 }
 # Deep enough to ride out a pause of the interpreter of a third of a second at 30 Hz; the profile's usual 5 are not.
 _IMAGE_DEPTH = 10
@@ -85,7 +79,7 @@ class Inputs:
                 _TYPES[stream.msgtype],
                 stream.topic,
                 self._callback(stream),
-                input_qos(stream.qos, _POSE_DEPTH if stream.parameter in _POSE_PARAMETERS else _IMAGE_DEPTH),
+                input_qos(stream.profile, _POSE_DEPTH if stream.role == "pose" else _IMAGE_DEPTH),
                 callback_group=group,
             )
             for stream in self.streams
@@ -114,7 +108,7 @@ class Inputs:
             self._tf.close()
         self.reset()
 
-    def _callback(self, stream: InputStream) -> Callable[[Any], None]:
+    def _callback(self, stream: Stream) -> Callable[[Any], None]:
         def received(message: Any) -> None:
             with self._lock:
                 stream.add(message)
@@ -140,9 +134,6 @@ class Inputs:
             self._take(paired)
 
 
-_POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
-
-
 def input_qos(profile: QosProfile, depth: int) -> QoSProfile:
     """The QoS of an input by profile name.
 
@@ -150,5 +141,10 @@ def input_qos(profile: QosProfile, depth: int) -> QoSProfile:
     ``transient_local`` is reliable and gets what a latched publisher said before; ``best_available`` is the most
     that all publishers give that are there when it subscribes, and with none there as ``transient_local``.
     """
-    reliability, durability = _POLICIES[profile]
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)
+    qos = QOS_PROFILES[profile]
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=depth,
+        reliability=ReliabilityPolicy[qos.reliability],
+        durability=DurabilityPolicy[qos.durability],
+    )

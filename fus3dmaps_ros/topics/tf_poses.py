@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from fus3dmaps_core.errors import ConfigError, FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import fields
 from fus3dmaps_core.sources.transforms import NoTransform, TransformGap
 
 
@@ -83,7 +83,7 @@ class TfListener:
     def _at(self, target: str, source: str, stamp_ns: int) -> tuple[NDArray[np.float64], int]:
         """A transform and its stamp; 0 asks for the latest."""
         stamped = self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns))
-        return messages.transform_of(stamped, "/tf"), messages.stamp_ns(stamped)
+        return fields.transform_of(stamped, "/tf"), fields.stamp_ns(stamped)
 
     def _is_ahead(self, target: str, source: str, stamp_ns: int) -> bool:
         """Whether a stamp is later than all that TF knows, so that the transform may still come."""

@@ -22,7 +22,7 @@ from stand_ins import wall_frame
 
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
-from fus3dmaps_core.recordings.storage import RawMessage, TopicSummary
+from fus3dmaps_core.recordings.recorded_files import RawMessage, TopicSummary
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_ros import player_node
 from fus3dmaps_ros.player_node import Player

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from fed_pairer import FedPairer
 from geometry_msgs.msg import PoseStamped
 from rclpy.serialization import deserialize_message
 from recorded_frames import assert_same_frames, noise_frames
@@ -12,7 +13,6 @@ from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
-from fus3dmaps_core.sources.pairing import FramePairer
 
 
 def test_recorded_messages_pass_through_ros_and_the_pairer(tmp_path):
@@ -20,7 +20,7 @@ def test_recorded_messages_pass_through_ros_and_the_pairer(tmp_path):
     with RecordingWriter(tmp_path / "bag.mcap") as writer:
         for frame in frames:
             writer.write(frame)
-    pairer = FramePairer(InputConfig())
+    pairer = FedPairer(InputConfig())
     inputs = {
         "/rgb/camera_info": (CameraInfo, pairer.add_camera_info),
         "/pose": (PoseStamped, pairer.add_pose),

@@ -1,1 +1,1 @@
-"""Plain buildings of many rooms whose every surface is labelled."""
+"""Simulated buildings of many rooms, made of boxes, with a label for every surface."""

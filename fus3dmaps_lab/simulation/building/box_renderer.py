@@ -1,4 +1,4 @@
-"""Colour, depth and parts of a world of boxes as a pinhole camera sees it, by ray casting; a few milliseconds a view."""
+"""Rendering of colour, depth and parts of a world of boxes by ray casting; a view takes a few milliseconds."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ class BoxView:
 
 
 class BoxRenderer:
-    """Renders one world from any pose; equal inputs give equal bits."""
+    """Renders views of one world; equal inputs give equal bits."""
 
     def __init__(self, world: BoxWorld) -> None:
         """Prepare ray casting."""
         self._world = world
         low, high = world.low_m, world.high_m
-        # Corner number xyz in binary, x the lowest bit.
+        # Corners are numbered by their bits xyz; x is the lowest.
         chosen = np.array([[(corner >> axis) & 1 for axis in range(3)] for corner in range(8)], bool)
         corners = np.where(chosen[None], high[:, None], low[:, None]).astype(np.float32)
         faces = np.array([[(a, b, c), (a, c, d)] for a, b, c, d in _FACES], np.uint32).reshape(1, _TRIANGLES_A_BOX, 3)
@@ -80,7 +80,7 @@ class BoxRenderer:
 
 @lru_cache(maxsize=4)
 def _directions(intrinsics: Intrinsics) -> NDArray[np.float32]:
-    """(H W, 3) rays of the pixel centres with z = 1, so that a ray's parameter is depth."""
+    """Return (H W, 3) rays through the pixel centres. Their z is 1, so the ray's parameter is depth."""
     xs = (np.arange(intrinsics.width) - intrinsics.cx) / intrinsics.fx
     ys = (np.arange(intrinsics.height) - intrinsics.cy) / intrinsics.fy
     x, y = np.meshgrid(xs, ys)

@@ -1,4 +1,4 @@
-"""Points on the surfaces of a world of boxes that can be seen from inside it."""
+"""Sampling of the surfaces that can be seen from inside a world of boxes."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from fus3dmaps_lab.simulation.building.box_world import BoxWorld
 from fus3dmaps_lab.simulation.truth import SurfacePoints
 
 _OUTWARD_M = 0.008
-"""How far in front of a surface its points must be free."""
+"""Free space needed in front of a surface point."""
 
 
 def surface_points(world: BoxWorld, insides_m: NDArray[np.float64], spacing_m: float) -> SurfacePoints:
-    """A grid of points on every face of every box, without those that touch another box or are outside the building.
+    """Sample every face of every box on a grid; leave out points that touch another box or lie outside the building.
 
     Args:
         world: The boxes.
-        insides_m: (n, 2, 3) lower and upper corners of what one can be in.
-        spacing_m: Of the grid, metres.
+        insides_m: (n, 2, 3) lower and upper corners of the spaces inside the building.
+        spacing_m: Spacing of the grid, metres.
     """
     points, parts = [], []
     low, high = world.low_m, world.high_m
@@ -48,7 +48,7 @@ def surface_points(world: BoxWorld, insides_m: NDArray[np.float64], spacing_m: f
 
 
 def _grid(low: NDArray[np.float64], high: NDArray[np.float64], spacing_m: float) -> NDArray[np.float64]:
-    """(n, 2) centres of cells of about the spacing that fill a rectangle."""
+    """Divide a rectangle into cells of about the given spacing and return their centres, (n, 2)."""
     counts = np.maximum(1, np.ceil((high - low) / spacing_m - 1e-6).astype(int))
     axes = [
         first + (np.arange(count) + 0.5) * (last - first) / count
@@ -58,7 +58,7 @@ def _grid(low: NDArray[np.float64], high: NDArray[np.float64], spacing_m: float)
 
 
 def _within(points: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which points are within any of the boxes."""
+    """Return which points lie inside at least one box."""
     found = np.zeros(len(points), bool)
     for first, last in zip(low, high, strict=True):
         found |= np.all((points > first) & (points < last), axis=1)

@@ -1,4 +1,4 @@
-"""A world of axis-aligned boxes, each a piece of a part of an instance of a class.
+"""A world of axis-aligned boxes. Each box belongs to a part, the part to an instance, the instance to a class.
 
 Frames: world x east, y north, z up, metres.
 """
@@ -18,7 +18,7 @@ Color = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class BoxWorld:
-    """All boxes of a world, and what they are.
+    """All boxes of a world with their labels.
 
     Attributes:
         low_m: (n, 3) float64 lower corners.
@@ -34,15 +34,6 @@ class BoxWorld:
     color: NDArray[np.uint8]
     truth: Truth
 
-    def instance_boxes_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corners of every instance: two (instances + 1, 3), the first without meaning."""
-        instance = self.truth.instance_of_part[self.part]
-        count = len(self.truth.class_of_instance)
-        low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(low, instance, self.low_m)
-        np.maximum.at(high, instance, self.high_m)
-        return low, high
-
 
 @dataclass(frozen=True)
 class Piece:
@@ -52,7 +43,7 @@ class Piece:
         part: Name of the part.
         low_m: Lower corner.
         high_m: Upper corner.
-        color: Of its surface.
+        color: Colour of its surface.
     """
 
     part: str
@@ -63,18 +54,18 @@ class Piece:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where an instance stands: quarter turns about z, then a translation.
+    """Place of an instance: quarter turns about z, then a translation.
 
     Attributes:
-        position_m: Of its origin.
-        quarter_turns: Counter-clockwise, as seen from above; 0 faces south, with its back to the north.
+        position_m: Position of its origin.
+        quarter_turns: Counter-clockwise, seen from above. With 0 it faces south, its back to the north.
     """
 
     position_m: tuple[float, float, float]
     quarter_turns: int = 0
 
     def place(self, low_m: Sequence[float], high_m: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner of a box of the instance's frame in the world."""
+        """Move a box from the instance's frame to the world and return its lower and upper corner."""
         corners = np.array([low_m, high_m], np.float64)
         for _ in range(self.quarter_turns % 4):
             corners[:, :2] = np.stack([-corners[:, 1], corners[:, 0]], axis=1)
@@ -84,10 +75,10 @@ class Pose:
 
 @dataclass
 class BoxWorldBuilder:
-    """Collects instances.
+    """Builds a world instance by instance.
 
     Attributes:
-        background: Names of the classes that are the building itself.
+        background: Names of the classes of the building itself.
     """
 
     background: frozenset[str]
@@ -97,7 +88,7 @@ class BoxWorldBuilder:
     _boxes: list[tuple[NDArray[np.float64], NDArray[np.float64], int, Color]] = field(default_factory=list)
 
     def add(self, class_name: str, pieces: Sequence[Piece], pose: Pose | None = None) -> int:
-        """Add an instance; pieces of the same part name are one part.
+        """Add an instance. Pieces with the same part name form one part.
 
         Returns:
             Its number.
@@ -121,7 +112,7 @@ class BoxWorldBuilder:
         return instance
 
     def build(self) -> BoxWorld:
-        """The world so far."""
+        """Return the world of all instances added so far."""
         truth = Truth(
             tuple(self._classes),
             frozenset(number for number, name in enumerate(self._classes) if name in self.background),

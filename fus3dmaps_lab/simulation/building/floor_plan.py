@@ -1,8 +1,8 @@
-"""The shell of a building: rooms on both sides of a corridor, storey upon storey, joined by stairs.
+"""Plan and shell of a building: storeys with rooms on both sides of a corridor, joined by stairs.
 
-A storey's corridor runs east along y = 0; rooms lie north and south of it, each with a door to it and a window in its outer
-wall. Beyond its eastern end are the stairs. Everything but doors, windows and stairs is walls, floors and ceilings; they are
-instances like anything else.
+Each storey's corridor runs east along y = 0. Rooms lie north and south of it; each has a door to it and a window in its
+outer wall. The stairs are beyond the corridor's eastern end. Walls, floors, ceilings, doors, windows and stairs are
+instances like everything else.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fus3dmaps_lab.simulation.building.box_world import BoxWorldBuilder, Color, Piece
 
 BACKGROUND = frozenset({"wall", "floor", "ceiling", "door", "window"})
-"""Classes of the building itself, as the published evaluations leave them out."""
+"""Classes of the building itself, which published evaluations leave out."""
 
 STOREY_M = 2.9
 CEILING_M = 2.6
@@ -36,7 +36,7 @@ _STAIRS: Color = (140, 132, 124)
 _WINDOW_SILL_M, _WINDOW_TOP_M, _WINDOW_WIDTH_M = 0.95, 2.1, 1.3
 
 Hole = tuple[float, float, float, float]
-"""In a wall along x: from and to along it, lower and upper edge, metres."""
+"""A hole in a wall along x: least x, greatest x, lower edge, upper edge, metres."""
 
 
 @dataclass(frozen=True)
@@ -59,35 +59,35 @@ class Room:
 
     @property
     def walls_y_m(self) -> tuple[float, float]:
-        """Where its walls to the corridor and to the outside begin."""
+        """Inner y of its corridor wall and of its outer wall."""
         y0, y1 = float(self.low_m[1]), float(self.high_m[1])
         return (y0, y1) if self.side > 0 else (y1, y0)
 
     def door_hole_m(self) -> Hole:
-        """Of the wall to the corridor."""
+        """Return the hole for the door in the corridor wall."""
         z, half = float(self.low_m[2]), 0.5 * DOOR_WIDTH_M
         return self.door_x_m - half, self.door_x_m + half, z, z + DOOR_HEIGHT_M
 
     def window_hole_m(self) -> Hole:
-        """Of the outer wall."""
+        """Return the hole for the window in the outer wall."""
         z, middle = float(self.low_m[2]), float(self.center_m[0])
         half = 0.5 * min(_WINDOW_WIDTH_M, float(self.high_m[0] - self.low_m[0]) - 0.8)
         return middle - half, middle + half, z + _WINDOW_SILL_M, z + _WINDOW_TOP_M
 
     @property
     def center_m(self) -> NDArray[np.float64]:
-        """(2,) middle of its floor."""
+        """Middle of its floor, (2,)."""
         return 0.5 * (self.low_m + self.high_m)[:2]
 
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Where everything is.
+    """The rooms and corridors of a building.
 
     Attributes:
-        storeys: How many.
-        length_m: Of the corridors, from x = 0.
-        rooms: Of all storeys, in the order in which a robot comes by.
+        storeys: Number of storeys.
+        length_m: Length of the corridors, which begin at x = 0.
+        rooms: Rooms of all storeys, in the order of the robot's route.
     """
 
     storeys: int
@@ -95,7 +95,7 @@ class FloorPlan:
     rooms: tuple[Room, ...]
 
     def insides_m(self) -> NDArray[np.float64]:
-        """(n, 2, 3) corners of everything that one can be in or look into: rooms, doorways, window niches, corridors."""
+        """Return (n, 2, 3) corners of all open spaces: rooms, doorways, window niches, corridors and stairs."""
         found = [np.stack([room.low_m, room.high_m]) for room in self.rooms]
         for room in self.rooms:
             inner, outer = room.walls_y_m
@@ -124,10 +124,10 @@ def plan_building(
     """Lay out the rooms.
 
     Args:
-        storeys: How many.
-        rooms_per_storey: Alternating between the two sides of the corridor.
+        storeys: Number of storeys.
+        rooms_per_storey: Number of rooms on each; they alternate between the two sides of the corridor.
         room_size_m: Least and greatest edge of a room.
-        rng: The only source of chance.
+        rng: Source of all random numbers.
     """
     rooms = []
     lengths = []
@@ -160,14 +160,14 @@ def build_shell(builder: BoxWorldBuilder, plan: FloorPlan) -> None:
 
 
 def door_zone_m(room: Room) -> NDArray[np.float64]:
-    """(2, 2) rectangle behind the door that stays free, where its leaf stands open too."""
+    """Return the (2, 2) rectangle behind the door that stays free; the open door leaf is in it."""
     wall_y = room.walls_y_m[0]
     y0, y1 = sorted((wall_y, wall_y + room.side * 1.2))
     return np.array([(room.door_x_m - 0.75, y0), (room.door_x_m + 0.75, y1)])
 
 
 def window_zone_m(room: Room) -> NDArray[np.float64]:
-    """(2, 2) rectangle along the window."""
+    """Return the (2, 2) rectangle along the window."""
     left, right, _, _ = room.window_hole_m()
     wall_y = room.walls_y_m[1]
     return np.array([(left, wall_y - 0.1), (right, wall_y + 0.1)])
@@ -179,7 +179,7 @@ def _box(part: str, low: tuple[float, float, float], high: tuple[float, float, f
 
 
 def _with_hole(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float, hole: Hole) -> list[Piece]:
-    """A wall along x with a rectangular hole (x from, x to, z from, z to)."""
+    """Make the pieces of a wall along x with a rectangular hole (x from, x to, z from, z to)."""
     left, right, below, above = hole
     boxes = [
         ((x0, y0, z0), (left, y1, z1)),
@@ -215,10 +215,10 @@ def _room(builder: BoxWorldBuilder, room: Room) -> None:
         ],
     )
     for edge, outside in ((x0, x0 - WALL_M), (x1, x1 + WALL_M)):
-        middle_x = 0.5 * (edge + outside)  # Rooms that are neighbours have half of the wall each.
+        middle_x = 0.5 * (edge + outside)  # Neighbouring rooms share a wall: each has half of it.
         builder.add("wall", [_box("wall", (edge, y0, z), (middle_x, y1, top), _WALL)])
     builder.add("wall", _with_hole(x0 - 0.5 * WALL_M, x1 + 0.5 * WALL_M, inner, inner - room.side * WALL_M, z, top, hole))
-    # Its leaf stands open on the side from which the robot does not come.
+    # The leaf stands open on the side where the robot does not drive.
     hinge_x, beside_x = (left, left - 0.04) if room.door_x_m < room.center_m[0] else (right, right + 0.04)
     builder.add(
         "door",

@@ -1,4 +1,4 @@
-"""What stands where in a room: pieces along the walls and small things on them, without interpenetration."""
+"""Furnishing of rooms: furniture along the walls with small things on it, without overlaps."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fus3dmaps_lab.simulation.building import catalogue as c
+from fus3dmaps_lab.simulation.building import things as t
 from fus3dmaps_lab.simulation.building.box_world import BoxWorldBuilder, Piece, Pose
-from fus3dmaps_lab.simulation.building.catalogue import Maker, Rng, Thing
+from fus3dmaps_lab.simulation.building.things import Maker, Rng, Thing
 
 _GAP_M = 0.06
 _ATTEMPTS = 40
@@ -18,11 +18,11 @@ _ATTEMPTS = 40
 
 @dataclass(frozen=True)
 class RoomKind:
-    """What belongs into a room.
+    """The furniture of a kind of room.
 
     Attributes:
-        name: Of the kind.
-        along_walls: Pieces that stand against walls, the most important first.
+        name: Name of the kind.
+        along_walls: Furniture that stands against walls, the most important first.
         small: Things that stand on surfaces.
         on_soft: Things that lie on sofas and beds.
     """
@@ -36,35 +36,35 @@ class RoomKind:
 KINDS = (
     RoomKind(
         "living room",
-        (c.sofa, c.cabinet, c.armchair, c.bookshelf, c.table, c.floor_lamp, c.plant, c.stool),
-        (c.television, c.vase, c.book, c.mug, c.bowl, c.table_lamp),
-        (c.pillow, c.pillow),
+        (t.sofa, t.cabinet, t.armchair, t.bookshelf, t.table, t.floor_lamp, t.plant, t.stool),
+        (t.television, t.vase, t.book, t.mug, t.bowl, t.table_lamp),
+        (t.pillow, t.pillow),
     ),
     RoomKind(
         "bedroom",
-        (c.bed, c.wardrobe, c.nightstand, c.desk, c.chair, c.floor_lamp, c.plant),
-        (c.table_lamp, c.book, c.mug, c.vase, c.monitor),
-        (c.pillow, c.pillow),
+        (t.bed, t.wardrobe, t.nightstand, t.desk, t.chair, t.floor_lamp, t.plant),
+        (t.table_lamp, t.book, t.mug, t.vase, t.monitor),
+        (t.pillow, t.pillow),
     ),
     RoomKind(
         "kitchen",
-        (c.counter, c.oven, c.refrigerator, c.counter, c.table, c.chair, c.chair, c.trash_can, c.sink),
-        (c.microwave, c.kettle, c.bowl, c.bottle, c.mug, c.mug, c.vase),
+        (t.counter, t.oven, t.refrigerator, t.counter, t.table, t.chair, t.chair, t.trash_can, t.sink),
+        (t.microwave, t.kettle, t.bowl, t.bottle, t.mug, t.mug, t.vase),
     ),
     RoomKind(
         "office",
-        (c.desk, c.chair, c.desk, c.chair, c.bookshelf, c.cabinet, c.plant, c.trash_can),
-        (c.monitor, c.keyboard, c.mug, c.book, c.table_lamp, c.bottle),
+        (t.desk, t.chair, t.desk, t.chair, t.bookshelf, t.cabinet, t.plant, t.trash_can),
+        (t.monitor, t.keyboard, t.mug, t.book, t.table_lamp, t.bottle),
     ),
     RoomKind(
         "bathroom",
-        (c.bathtub, c.toilet, c.sink, c.washing_machine, c.cabinet, c.trash_can, c.stool),
-        (c.towel, c.bottle, c.vase, c.towel),
+        (t.bathtub, t.toilet, t.sink, t.washing_machine, t.cabinet, t.trash_can, t.stool),
+        (t.towel, t.bottle, t.vase, t.towel),
     ),
     RoomKind(
         "storage",
-        (c.bookshelf, c.wardrobe, c.box, c.box, c.table, c.box, c.stool, c.box),
-        (c.bottle, c.book, c.bowl, c.towel),
+        (t.bookshelf, t.wardrobe, t.box, t.box, t.table, t.box, t.stool, t.box),
+        (t.bottle, t.book, t.bowl, t.towel),
     ),
 )
 
@@ -76,7 +76,7 @@ class Space:
     Attributes:
         low_m: Lower corner, on the floor.
         high_m: Upper corner, below the ceiling.
-        reserved_m: (n, 2, 2) rectangles (low xy, high xy) that must stay free: doors and the robot's way.
+        reserved_m: (n, 2, 2) rectangles (low xy, high xy) that must stay free: doors and the robot's route.
         windows_m: (n, 2, 2) rectangles along the walls where nothing can hang.
     """
 
@@ -87,7 +87,7 @@ class Space:
 
 
 def furnish(builder: BoxWorldBuilder, kind: RoomKind, space: Space, rng: Rng) -> None:
-    """Put things into a room: what finds no place is left out."""
+    """Put things into a room; leave out those that find no place."""
     taken = [*space.reserved_m]
     for maker in kind.along_walls:
         thing = maker(rng)
@@ -103,14 +103,14 @@ def furnish(builder: BoxWorldBuilder, kind: RoomKind, space: Space, rng: Rng) ->
             _fill_shelves(builder, pose, rng)
     taken += [*space.windows_m]
     for _ in range(2):
-        _hang(builder, c.picture(rng), space, taken, rng)
+        _hang(builder, t.picture(rng), space, taken, rng)
     center = 0.5 * (space.low_m + space.high_m)
-    rug = c.rug(rng)
+    rug = t.rug(rng)
     builder.add(rug.class_name, rug.pieces, Pose((float(center[0]), float(center[1]) + 0.65, float(space.low_m[2]))))
 
 
 def _place_at_wall(thing: Thing, space: Space, taken: list[NDArray[np.float64]], rng: Rng) -> Pose | None:
-    """A place along a wall, noted as taken; None where none was found."""
+    """Find a place along a wall and mark it as taken; return None if there is none."""
     width, depth, _ = thing.size_m
     for _ in range(_ATTEMPTS):
         turns = int(rng.integers(4))
@@ -126,8 +126,8 @@ def _place_at_wall(thing: Thing, space: Space, taken: list[NDArray[np.float64]],
 
 
 def _at_wall(space: Space, turns: int, width: float, share: float, z: float) -> Pose | None:
-    """A pose with its back at one of the four walls (0: the northern), ``share`` along it."""
-    along = turns % 2  # The axis of the wall: x for the northern and the southern one.
+    """Return a pose with its back to one of the four walls (0: the northern), at a share of the wall's length."""
+    along = turns % 2  # The axis of the wall: x for the northern and the southern wall.
     room = float(space.high_m[along] - space.low_m[along]) - width - 2 * _GAP_M
     if room < 0:
         return None
@@ -144,7 +144,7 @@ def _meets(rectangle: NDArray[np.float64], others: Sequence[NDArray[np.float64]]
 
 
 def _decorate(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequence[Maker], rng: Rng) -> None:
-    """Two to four small things on a surface, side by side; what goes behind is behind what goes in front."""
+    """Put two to four small things side by side on a surface."""
     width, depth, _ = thing.size_m
     chosen = [makers[int(index)](rng) for index in rng.permutation(len(makers))[: int(rng.integers(2, 5))]]
     x = -0.5 * width + 0.04
@@ -157,7 +157,7 @@ def _decorate(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequen
 
 
 def _cushion(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequence[Maker], rng: Rng) -> None:
-    """Pillows: side by side on a sofa, behind one another at the head of a bed."""
+    """Add pillows: side by side on a sofa, behind one another at the head of a bed."""
     things = [maker(rng) for maker in makers]
     for place, small in enumerate(things):
         if thing.class_name == "sofa":
@@ -169,20 +169,20 @@ def _cushion(builder: BoxWorldBuilder, thing: Thing, pose: Pose, makers: Sequenc
 
 
 def _fill_shelves(builder: BoxWorldBuilder, pose: Pose, rng: Rng) -> None:
-    """A row of books on every board: one instance each row, its books the parts."""
-    for z in c.SHELF_HEIGHTS_M:
+    """Put a row of books on every board. Each row is one instance; its books are the parts."""
+    for z in t.SHELF_HEIGHTS_M:
         pieces: list[Piece] = []
         x, end = -0.45, float(rng.uniform(-0.1, 0.42))
         while x < end:
             thick, tall = float(rng.uniform(0.03, 0.06)), float(rng.uniform(0.22, 0.36))
             low, high = (x, -0.26, z + 0.03), (x + thick, -0.04, z + 0.03 + tall)
-            pieces.append(Piece(f"book {len(pieces)}", low, high, c.book(rng).pieces[0].color))
+            pieces.append(Piece(f"book {len(pieces)}", low, high, t.book(rng).pieces[0].color))
             x += thick + 0.002
         builder.add("books", pieces, pose)
 
 
 def _hang(builder: BoxWorldBuilder, thing: Thing, space: Space, taken: list[NDArray[np.float64]], rng: Rng) -> None:
-    """On a piece of wall where nothing stands and no door or window is."""
+    """Hang a thing on a piece of wall without furniture, door or window."""
     for _ in range(_ATTEMPTS):
         pose = _at_wall(space, int(rng.integers(4)), thing.size_m[0], float(rng.uniform()), float(space.low_m[2]) + 1.5)
         if pose is None:

@@ -1,1 +1,1 @@
-"""Encoders and a segmenter with stated statistics, which know the simulated truth."""
+"""Simulated encoders and a simulated segmenter: they know the ground truth and err with stated statistics."""

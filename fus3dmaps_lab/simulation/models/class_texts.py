@@ -1,6 +1,6 @@
-"""Text embeddings of a simulated vision-language space: alike within a group of meanings, less so between groups.
+"""Text embeddings of a simulated vision-language space: similar within a group of meanings, less so between groups.
 
-Every vector is composed of three orthogonal directions: one that all texts share (texts of CLIP-like spaces fill a narrow
+Every vector is a sum of three orthogonal directions: one that all texts share (texts of CLIP-like spaces fill a narrow
 cone), one that a group of related things shares, and one of its own. With a the cosine of unrelated and b that of related
 texts, their squared shares are a, b - a and 1 - b; for a text without a group they are a, 0 and 1 - a.
 """
@@ -37,7 +37,7 @@ GROUPS: tuple[frozenset[str], ...] = tuple(
         "rug carpet mat towel",
     )
 )
-"""Words that mean related things; a text belongs to the group of its last word that is in one."""
+"""Groups of words with related meanings. A text belongs to the group of its last word that is in any group."""
 
 _KIND_COMMON, _KIND_GROUP, _KIND_TEXT = 11, 12, 13
 
@@ -46,12 +46,12 @@ _KIND_COMMON, _KIND_GROUP, _KIND_TEXT = 11, 12, 13
 class TextSimilarity:
     """Mean cosine of two texts, 0 <= ``unrelated`` <= ``related`` < 1.
 
-    Single pairs scatter about it, since two texts' own directions are random: by (1 - related) / sqrt(dimension) within a
-    group, by no more than (1 - unrelated) / sqrt(dimension) between texts of different groups.
+    Single cosines scatter around the mean, because the texts' own directions are random: by (1 - related) / sqrt(dimension)
+    within a group, by no more than (1 - unrelated) / sqrt(dimension) between texts of different groups.
 
     Attributes:
-        unrelated: Of different groups, or of no group. Short prompts of CLIP-like models lie between 0.5 and 0.7.
-        related: Of one group.
+        unrelated: Cosine of texts of different groups or of no group. For short prompts, CLIP-like models have 0.5 to 0.7.
+        related: Cosine of texts of one group.
     """
 
     unrelated: float = 0.6
@@ -64,9 +64,9 @@ class TextSimilarity:
 
 
 class ClassTexts:
-    """The text encoder's space in a simulation.
+    """The text embeddings of a simulation.
 
-    A vector depends on its text, the seed, the dimension and the similarity alone: not on what other classes there are.
+    A vector depends only on its text, the seed, the dimension and the similarity, not on the other classes.
     """
 
     def __init__(
@@ -75,11 +75,11 @@ class ClassTexts:
         """Embed the classes.
 
         Args:
-            class_names: As in ``Truth``: the first is empty and stands for nothing, which has an embedding as well, since
-                pixels that show nothing have one.
+            class_names: As in ``Truth``. The first is empty and stands for nothing; it has an embedding too, for pixels that
+                show nothing.
             dimension: Width d of the embeddings, at least 4.
-            seed: Of all directions.
-            similarity: Mean cosines; its defaults without.
+            seed: Seed of all directions.
+            similarity: Mean cosines; None takes the defaults.
 
         Raises:
             ConfigError: The dimension is too small, or the seed negative.
@@ -93,9 +93,9 @@ class ClassTexts:
         self.vectors: NDArray[np.float32] = self.encode(class_names)
 
     def encode(self, prompts: Sequence[str]) -> NDArray[np.float32]:
-        """Embed n texts: (n, d) float32, unit length. Case and outer spaces do not matter.
+        """Embed n texts as (n, d) float32 unit vectors. Case and outer spaces do not matter.
 
-        A text that is no class name is composed like one: by the group of its words, with a seeded direction of its own.
+        A text that is no class name is embedded like one: by its group, with a seeded direction of its own.
         """
         rows = np.empty((len(prompts), self._dimension), np.float32)
         for row, prompt in enumerate(prompts):
@@ -117,7 +117,7 @@ class ClassTexts:
         return np.asarray(vector / np.linalg.norm(vector), np.float32)
 
     def _direction(self, kind: int, number: int, orthogonal_to: Sequence[NDArray[np.float64]] = ()) -> NDArray[np.float64]:
-        """Random unit vector, orthogonal to orthonormal others."""
+        """Draw a random unit vector that is orthogonal to the given orthonormal vectors."""
         vector = np.random.default_rng((self._seed, kind, number)).standard_normal(self._dimension)
         for other in orthogonal_to:
             vector -= (vector @ other) * other
@@ -126,7 +126,7 @@ class ClassTexts:
 
 
 def group_of(text: str) -> int | None:
-    """Which of GROUPS a text belongs to: that of its last word that is in one, as in "office chair"; None without."""
+    """Return the group of a text: that of its last word that is in one, as in "office chair"; None without one."""
     for word in reversed(text.lower().replace("-", " ").replace("_", " ").split()):
         for number, words in enumerate(GROUPS):
             if word in words:

@@ -1,40 +1,39 @@
-"""The stated statistics of the simulated encoders."""
+"""Statistics by which the simulated encoders err."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 from fus3dmaps_core.errors import ConfigError
 
 REFERENCE_WIDTH_PX = 640
-"""Width of the image in which statistics in pixels are stated; they scale with the width of the image at hand."""
+"""Image width for which statistics in pixels are stated; they scale with the width of the actual image."""
 
 DENSE_SAMPLES, INSTANCE_SAMPLES = 5, 9
-"""Pixels of a patch that the layers count, as the map samples by default."""
+"""Pixels of a patch that the dense and the instance layer count, with the map's default sampling."""
 
 
 @dataclass(frozen=True)
 class EncoderStatistics:
-    """How the simulated encoders err. Both err in two ways: they mix in what is beside a thing, and they are noisy.
+    """The errors of the simulated encoders. Both mix in neighbouring things, and both are noisy.
 
     An embedding is normalise(s + n). The signal s is a mean of unit vectors, one per instance, weighted by shares that sum
-    to 1: it has length 1 where one instance is seen alone and is shorter where several mix. The noise n is isotropic,
-    Gaussian and independent between patches, between crops and between frames: the part of a real encoder's error that
-    persists from view to view is only modelled by mixing and by an offset per instance. ``patch_variance`` is R^D and
+    to 1. Its length is 1 if one instance is seen alone and less if several mix. The noise n is isotropic,
+    Gaussian and independent between patches, crops and frames. The part of a real encoder's error that persists from view
+    to view is modelled only by mixing and by an offset per instance. ``patch_variance`` is R^D and
     ``crop_variance`` is R^I: the expected squared length of n *before* the normalisation, over all d dimensions together,
     for one embedding of one patch or one crop. A dimension of n has the variance R / d.
     No error is shared by neighbouring frames alone.
 
-    That is with ``noise_per`` "embedding". The fusion formula assumes something else [sec: 3D Cross-Layer Semantic Fusion]:
-    that every *counted* observation of a voxel is independent, with a variance of R^D in the dense layer and of R^I in the
-    instance layer. With "observation" these are the variances of one counted observation: the embedding of a patch, which
-    is counted 5 times, has R^D / 5, that of a crop, counted N = 9 times for each patch that its mask covers, R^I / N.
+    This holds with ``noise_per`` "embedding". The fusion formula makes another assumption [sec: 3D Cross-Layer Semantic
+    Fusion]: every *counted* observation of a voxel is independent, with variance R^D in the dense layer and R^I in the
+    instance layer. With "observation", R^D and R^I are the variances of one counted observation. A patch is counted 5 times,
+    so its embedding has R^D / 5; a crop is counted N = 9 times for each patch that its mask covers, so it has R^I / N.
 
-    With the defaults, and class texts as alike as their defaults, a single patch that shows one thing is named rightly in
-    about 4 of 10 cases and a single crop in about 8 of 10, among 30 common indoor classes. These numbers were chosen before
-    anything was mapped; they are no measurement of any model.
+    With the defaults, also of the class texts, about 4 of 10 single patches that show one thing get the right name among 30
+    common indoor classes, and about 8 of 10 single crops. These numbers were chosen before anything was mapped; they are not
+    measured on any model.
 
     Attributes:
         dimension: Width d of the embeddings.
@@ -44,12 +43,12 @@ class EncoderStatistics:
         receptive_field_patches: Sigma of the Gaussian receptive field of a patch, in patches; it makes embeddings bleed over
             the boundaries of objects. 0 mixes within the patch alone.
         crop_padding: Padding around a mask's box on each side, as a share of its size.
-        crop_mask_weight: Weight of a pixel inside the mask where one of the rest of the crop has 1: models attend to the
-            middle of an image. At 1, object and background count by their share of the crop.
+        crop_mask_weight: Weight of a pixel inside the mask; other pixels of the crop have 1. It is greater than 1 because
+            models attend to the middle of an image. At 1, object and background count by their share of the crop.
         appearance_variance: Expected squared length of the offset between an instance and its class text, before the
             instance's vector is normalised. All views of an instance, of either encoder, share its offset.
-        noise_per: What has the variances R^D and R^I, see above.
-        seed: Of everything that is drawn.
+        noise_per: What R^D and R^I are the variances of, see above.
+        seed: Seed of all random numbers.
     """
 
     dimension: int = 128
@@ -64,7 +63,7 @@ class EncoderStatistics:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ConfigError, which names the field, where a number is out of range."""
+        """Raise ConfigError, which names the field, if a number is out of range."""
         for name, least in (
             ("dimension", 4),
             ("patch_variance", 0),
@@ -94,10 +93,10 @@ class EncoderStatistics:
         return self.patch_variance / (DENSE_SAMPLES if self.noise_per == "observation" else 1)
 
     def crop_noise_variance(self, patches: float) -> float:
-        """Expected squared length of the noise of a crop's embedding.
+        """Compute the expected squared length of the noise of a crop's embedding.
 
         Args:
-            patches: How many patches its mask covers.
+            patches: Number of patches that its mask covers.
         """
         counted = max(1.0, INSTANCE_SAMPLES * patches)
         return self.crop_variance / (counted if self.noise_per == "observation" else 1)
@@ -106,17 +105,3 @@ class EncoderStatistics:
     def variance_ratio(self) -> float:
         """R^D / R^I, the method's lambda; 1 without noise."""
         return self.patch_variance / self.crop_variance if self.crop_variance > 0 else 1.0
-
-    @property
-    def normalised_variance_ratio(self) -> float:
-        """The lambda that is best for means of *unit* embeddings of one pure signal; 1 without noise.
-
-        In many dimensions |s + n|^2 is close to 1 + R, so a unit embedding holds the signal with a length of
-        (1 + R)^-1/2 and noise of variance R / (1 + R). A sum of one patch and lambda crops then has the highest ratio of
-        signal to noise at lambda = R^D / R^I * sqrt((1 + R^I) / (1 + R^D)). That is R^D / R^I where both are small, and
-        its square root where both are large: normalising gives noisy embeddings a lower weight already.
-
-        It holds for independent observations. The map counts points: those of one patch share its noise, and all points
-        of a mask share that of its crop, while an instance's embedding is a mean over all the frames that saw it.
-        """
-        return self.variance_ratio * math.sqrt((1.0 + self.crop_variance) / (1.0 + self.patch_variance))

@@ -1,8 +1,8 @@
-"""A simulation of an encoder trio: embeddings made from the truth, with the stated statistics of ``EncoderStatistics``.
+"""A simulated encoder trio: embeddings made from the ground truth, with the errors of ``EncoderStatistics``.
 
-Noise comes from a generator that is seeded by the statistics' seed, the frame's stamp and, for a crop, its mask: the same
-frame gives the same embeddings bit for bit, in whatever order, company or batches it is encoded. Statistics that differ in
-a variance alone scale the same draws.
+Noise comes from a generator seeded by the statistics' seed, the frame's stamp and, for a crop, its mask. The same frame
+gives the same embeddings bit for bit, in any order and in any batches. Statistics that differ only in a variance scale the
+same random numbers.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _KIND_PATCH, _KIND_CROP, _KIND_APPEARANCE = 21, 22, 23
 def simulated_trio(
     oracle: Oracle, truth: Truth, statistics: EncoderStatistics, similarity: TextSimilarity | None = None
 ) -> EncoderTrio:
-    """The simulated trio of one world; its image encoders see the truth through the oracle.
+    """Make the simulated trio of one world; its image encoders see the truth through the oracle.
 
     Args:
         oracle: Must look at a frame before it is encoded.
-        truth: What part, instance and class numbers mean.
-        statistics: How the encoders err.
-        similarity: How alike class texts are; the defaults without.
+        truth: Parts, instances and classes of the world.
+        statistics: Errors of the encoders.
+        similarity: Similarity of class texts; None takes the defaults.
 
     Returns:
         A trio named ``simulation`` whose variance ratio is the statistics' own.
@@ -55,7 +55,7 @@ def simulated_trio(
 
 
 def instance_vectors(truth: Truth, texts: ClassTexts, statistics: EncoderStatistics) -> NDArray[np.float32]:
-    """What each instance looks like: normalise(its class text + an offset of its own).
+    """Compute the look of each instance: normalise(its class text + an offset of its own).
 
     Returns:
         (instances + 1, d) float32, unit length; 0 is nothing, which has no offset.
@@ -67,14 +67,14 @@ def instance_vectors(truth: Truth, texts: ClassTexts, statistics: EncoderStatist
 
 
 class SimulatedPatchEncoder:
-    """Simulation of a patch encoder: normalise(mean look of what the receptive field holds + noise of variance R^D)."""
+    """Simulated patch encoder: normalise(mean look in the receptive field + noise of variance R^D)."""
 
     def __init__(self, oracle: Oracle, truth: Truth, looks: NDArray[np.float32], statistics: EncoderStatistics) -> None:
-        """Keep the truth; ``looks`` are the (instances + 1, d) vectors of :func:`instance_vectors`."""
+        """Store the truth; ``looks`` are the (instances + 1, d) vectors of :func:`instance_vectors`."""
         self._oracle, self._truth, self._looks, self._statistics = oracle, truth, looks, statistics
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Rows and columns: patches are as wide a share of the image at any size, as near to square as rows allow."""
+        """Return rows and columns of patches: the columns are the same at any image size, the patches nearly square."""
         return _grid(height, width, self._statistics)
 
     def encode_patches(self, rgb: NDArray[np.uint8]) -> PatchEmbeddings:
@@ -96,14 +96,14 @@ class SimulatedPatchEncoder:
 
 
 class SimulatedCropEncoder:
-    """Simulation of a crop encoder: normalise(mean look of the padded box, the mask's pixels weighted + noise R^I)."""
+    """Simulated crop encoder: normalise(mean look in the padded box, weighted by the mask, + noise of variance R^I)."""
 
     def __init__(self, oracle: Oracle, truth: Truth, looks: NDArray[np.float32], statistics: EncoderStatistics) -> None:
-        """Keep the truth; ``looks`` are the (instances + 1, d) vectors of :func:`instance_vectors`."""
+        """Store the truth; ``looks`` are the (instances + 1, d) vectors of :func:`instance_vectors`."""
         self._oracle, self._truth, self._looks, self._statistics = oracle, truth, looks, statistics
 
     def encode_crops(self, rgb: NDArray[np.uint8], masks: Masks) -> NDArray[np.float32]:
-        """Embed one crop per mask of the frame that the oracle looks at: (n, d) float32, unit length.
+        """Embed one crop per mask of the frame that the oracle looks at, as (n, d) float32 unit vectors.
 
         Raises:
             EncoderError: The oracle looks at another frame or at none.
@@ -118,18 +118,18 @@ class SimulatedCropEncoder:
             x0, y0, x1, y1 = (int(value) for value in box)
             window = padded_box(x0, y0, x1, y1, labels.shape, statistics.crop_padding)
             shares = crop_shares(labels[window], mask[window], len(seen), statistics.crop_mask_weight)
-            # The mask names its draw: not its place among others, which depends on what was filtered and on batches.
+            # The seed uses the mask itself, not its row, which depends on filtering and on batches.
             name = zlib.crc32(np.packbits(mask[y0:y1, x0:x1]).tobytes())
             noise = np.random.default_rng((statistics.seed, _KIND_CROP, x0, y0, x1, y1, name, stamp))
             variance = statistics.crop_noise_variance(float(np.count_nonzero(mask) / pixels_a_patch))
             scale = np.float32((variance / statistics.dimension) ** 0.5)
-            # A product per crop, not one for all: those of several rows may be summed in another order.
+            # One product per crop: a product of several rows may sum in another order.
             vectors[row] = shares @ self._looks[seen] + scale * noise.standard_normal(statistics.dimension, np.float32)
         return _unit(vectors)
 
 
 class SimulatedTextEncoder:
-    """Simulation of a text encoder.
+    """Simulated text encoder.
 
     Attributes:
         space: Name of the trio.
@@ -138,11 +138,11 @@ class SimulatedTextEncoder:
     space = NAME
 
     def __init__(self, texts: ClassTexts) -> None:
-        """Answer from these texts."""
+        """Take the embeddings from ``texts``."""
         self._texts = texts
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
-        """Embed n prompts: (n, d) float32, unit length."""
+        """Embed n prompts as (n, d) float32 unit vectors."""
         return self._texts.encode(prompts)
 
 
@@ -154,20 +154,20 @@ def _grid(height: int, width: int, statistics: EncoderStatistics) -> tuple[int, 
 def receptive_shares(
     labels: NDArray[np.integer], count: int, rows: int, columns: int, sigma_patches: float
 ) -> NDArray[np.float32]:
-    """How much of a patch's receptive field each label holds.
+    """Compute the share of each label in the receptive field of each patch.
 
-    Shares of the pixels of each patch, averaged over the patches of the image with the weights of a Gaussian around the
-    patch; beyond the image there is nothing to see, and weights sum to 1 inside it.
+    The shares of the pixels of each patch are averaged over all patches, with Gaussian weights around each one that sum to 1
+    inside the image.
 
     Args:
         labels: (H, W), each in 0 .. ``count`` - 1.
         count: Number of labels.
-        rows: Of the patch grid, at most H.
-        columns: Of the patch grid, at most W.
+        rows: Rows of the patch grid, at most H.
+        columns: Columns of the patch grid, at most W.
         sigma_patches: Sigma of the Gaussian, in patches; 0 keeps each patch to itself.
 
     Returns:
-        (rows, columns, count) float32, sums of 1.
+        (rows, columns, count) float32; the labels of each patch sum to 1.
     """
     height, width = labels.shape
     cells = _cells(height, width, rows, columns)
@@ -180,7 +180,7 @@ def receptive_shares(
 
 
 def crop_shares(labels: NDArray[np.integer], mask: NDArray[np.bool_], count: int, mask_weight: float) -> NDArray[np.float32]:
-    """Share of each label among the pixels of a crop, where a pixel of the mask counts ``mask_weight`` times.
+    """Compute the share of each label among the pixels of a crop; a pixel of the mask counts ``mask_weight`` times.
 
     Args:
         labels: (h, w), each in 0 .. ``count`` - 1.
@@ -197,13 +197,13 @@ def crop_shares(labels: NDArray[np.integer], mask: NDArray[np.bool_], count: int
 
 
 def padded_box(x0: int, y0: int, x1: int, y1: int, shape: tuple[int, ...], padding: float) -> tuple[slice, slice]:
-    """Rows and columns of a box padded by a share of its size on each side, within an (H, W) image."""
+    """Return rows and columns of a box, padded on each side by a share of its size, within an (H, W) image."""
     pad_x, pad_y = int(padding * (x1 - x0)), int(padding * (y1 - y0))
     return np.s_[max(0, y0 - pad_y) : min(shape[0], y1 + pad_y), max(0, x0 - pad_x) : min(shape[1], x1 + pad_x)]
 
 
 def _instances(oracle: Oracle, truth: Truth, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Instances in the image, ascending, and (H, W) which of them each pixel shows, counted from 0."""
+    """Return the instances in the image, ascending, and for each pixel its place among them, (H, W)."""
     instances = truth.instance_of_part[oracle.parts_of(rgb)]
     present = np.bincount(instances.reshape(-1)) > 0
     number = np.cumsum(present) - 1
@@ -212,7 +212,7 @@ def _instances(oracle: Oracle, truth: Truth, rgb: NDArray[np.uint8]) -> tuple[ND
 
 @lru_cache(maxsize=8)
 def _cells(height: int, width: int, rows: int, columns: int) -> NDArray[np.int64]:
-    """(H, W) patch of each pixel, row-major, as the pipeline's pixel samples have it."""
+    """Return the row-major patch number of each pixel, (H, W), as in the pipeline's pixel samples."""
     down = np.arange(height) * rows // height
     across = np.arange(width) * columns // width
     cells: NDArray[np.int64] = down[:, None] * columns + across
@@ -222,7 +222,7 @@ def _cells(height: int, width: int, rows: int, columns: int) -> NDArray[np.int64
 
 @lru_cache(maxsize=8)
 def _gaussian_weights(count: int, sigma: float) -> NDArray[np.float32]:
-    """(count, count) weights of each place of a line for the average around each place; rows sum to 1."""
+    """Return (count, count) Gaussian weights of all places of a line around each place; rows sum to 1."""
     if sigma == 0:
         return np.eye(count, dtype=np.float32)
     distance = np.arange(count)[:, None] - np.arange(count)
@@ -239,5 +239,5 @@ def _unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _seed_word(stamp_ns: int) -> int:
-    """A stamp as seeds must be: not negative."""
+    """Turn a stamp into a seed, which must not be negative."""
     return stamp_ns % 2**64

@@ -1,7 +1,6 @@
-"""A simulation of a class-agnostic segmenter: masks made from the truth, with stated rates of error.
+"""A simulated class-agnostic segmenter: masks made from the ground truth, with stated rates of error.
 
-Chance comes from a generator that is seeded by the statistics' seed and the frame's stamp: the same frame gives the same
-masks bit for bit.
+Random numbers are seeded by the statistics' seed and the frame's stamp: the same frame gives the same masks bit for bit.
 """
 
 from __future__ import annotations
@@ -24,31 +23,31 @@ _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 
 @dataclass(frozen=True)
 class SegmenterStatistics:
-    """How the simulated segmenter errs.
+    """The errors of the simulated segmenter.
 
-    Every instance in view, background surfaces too, has one fate per frame: it is missed, or else split into its parts,
-    or else merged with a neighbour, or else masked whole. Probabilities are of that fate given that none before came true.
-    Lengths and areas in pixels are those of an image 640 wide and scale with the image at hand.
+    In every frame, each visible instance (also a background surface) is treated in one of four ways: it is missed, or else
+    split into its parts, or else merged with a neighbour, or else masked whole. Each probability holds if none of the
+    earlier cases happened. Lengths and areas in pixels are those of an image 640 wide and scale with the actual image.
 
     Attributes:
-        miss_probability: That a large instance is missed.
-        small_miss_probability: That one is missed whose area goes to 0. In between, the excess halves with every
-            ``small_area_px`` of area.
+        miss_probability: Probability that a large instance is missed.
+        small_miss_probability: The same for an instance whose area goes to 0. In between, the difference to
+            ``miss_probability`` halves with every ``small_area_px`` of area.
         small_area_px: See above, square pixels.
-        split_probability: That an instance of at least two visible parts is split where it is as near as ``split_near_m``;
-            with its mean distance along the optical axis this falls in a straight line to 0 at ``split_far_m``.
+        split_probability: Probability that an instance of at least two visible parts is split at a mean depth up to
+            ``split_near_m``. It falls linearly to 0 at ``split_far_m``.
         split_near_m: Metres.
         split_far_m: Metres.
-        merge_probability: That an instance is merged with a neighbour, where it has one: an instance, neither of the two
-            background, whose pixels touch its own with a depth step below ``touch_m``. Of several it is that with the
-            longest common border. Where both choose each other, the frame has one mask of the two.
+        merge_probability: Probability that an instance is merged with its neighbour: the instance with the longest common
+            border whose pixels touch its own with a depth step below ``touch_m``. Neither of the two is background. If both
+            choose each other, the frame has one mask of the two.
         touch_m: Metres.
-        keep_whole_probability: That a split or merged instance has its whole mask as well; masks then overlap.
-        cut_probability: That a mask of several unconnected pieces, as occlusion makes them, falls into a mask for each.
-        jitter_px: A mask is eroded or dilated by a whole number of pixels, equally likely from - to + the scaled value of
-            this, rounded.
-        min_area_px: Masks with fewer pixels are not given out, square pixels.
-        seed: Of everything that is drawn.
+        keep_whole_probability: Probability that a split or merged instance has its whole mask as well; masks then overlap.
+        cut_probability: Probability that a mask of several unconnected pieces, caused by occlusion, becomes one mask each.
+        jitter_px: A mask is eroded or dilated by a whole number of pixels, drawn evenly between plus and minus the scaled
+            and rounded value of this.
+        min_area_px: Least area of a mask, square pixels.
+        seed: Seed of all random numbers.
     """
 
     miss_probability: float = 0.05
@@ -66,7 +65,7 @@ class SegmenterStatistics:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ConfigError, which names the field, where a number is out of range."""
+        """Raise ConfigError, which names the field, if a number is out of range."""
         for field in fields(self):
             value = getattr(self, field.name)
             most = 1.0 if field.name.endswith("probability") else float("inf")
@@ -81,26 +80,26 @@ class SegmenterStatistics:
             raise ConfigError("segmenter statistics: small_area_px must be positive, got 0")
 
     def miss_at(self, area_px: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Probability that an instance is missed, by its visible area in pixels of an image 640 wide."""
+        """Compute the probability of a miss from visible areas, in pixels of an image 640 wide."""
         excess = self.small_miss_probability - self.miss_probability
         return np.asarray(self.miss_probability + excess * 0.5 ** (area_px / self.small_area_px), np.float64)
 
     def split_at(self, distance_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Probability that an instance with several visible parts is split, by its distance in metres."""
+        """Compute the probability of a split from distances in metres, for instances with several visible parts."""
         share = (self.split_far_m - distance_m) / (self.split_far_m - self.split_near_m)
         return np.asarray(self.split_probability * np.clip(share, 0.0, 1.0), np.float64)
 
 
 class SimulatedSegmenter:
-    """Simulation of a segmenter: sees the truth through the oracle and gives out masks with the stated errors."""
+    """Simulated segmenter: it sees the truth through the oracle and returns masks with the stated errors."""
 
     def __init__(self, oracle: Oracle, truth: Truth, statistics: SegmenterStatistics) -> None:
-        """Keep the truth; the oracle must look at a frame before it is segmented."""
+        """Store the truth; the oracle must look at a frame before it is segmented."""
         self._oracle, self._truth, self._statistics = oracle, truth, statistics
         self._background = np.isin(truth.class_of_instance, sorted(truth.background))
 
     def segment(self, rgb: NDArray[np.uint8], depth_m: NDArray[np.float32]) -> Masks:
-        """Masks of the frame that the oracle looks at, by instance; the measured depth is ignored.
+        """Make the masks of the frame that the oracle looks at, by instance; the measured depth is ignored.
 
         Args:
             rgb: (H, W, 3) uint8.
@@ -134,7 +133,7 @@ class SimulatedSegmenter:
                     found.add(window, part)
             elif merged[row] and neighbours[row] >= 0:
                 group = frozenset((row, int(neighbours[row])))
-                if group not in groups:  # The other of the two may have asked already.
+                if group not in groups:  # The other instance may have added it already.
                     found.add(*view.mask(sorted(group)))
                 groups.add(group)
             else:
@@ -145,10 +144,10 @@ class SimulatedSegmenter:
 
 
 class _View:
-    """What an image truly shows, by instance.
+    """The ground truth of an image, by instance.
 
     Attributes:
-        instances: (n,) int64 in view, ascending, nothing included.
+        instances: (n,) int64 instances in view, ascending, including 0 (nothing).
         areas: (n,) int64 pixels.
         distances_m: (n,) mean true depth.
     """
@@ -169,7 +168,7 @@ class _View:
         self._spans_x = [_span(column) for column in columns.reshape(-1, n).T > 0]
 
     def mask(self, rows: list[int]) -> tuple[tuple[slice, slice], NDArray[np.bool_]]:
-        """Where in the image some instances are, and which pixels there are theirs."""
+        """Return the window of the image that holds some instances, and their mask in it."""
         y, x = (
             slice(min(spans[row].start for row in rows), max(spans[row].stop for row in rows))
             for spans in (self._spans_y, self._spans_x)
@@ -181,13 +180,13 @@ class _View:
         return (y, x), mask
 
     def parts_in(self, window: tuple[slice, slice], mask: NDArray[np.bool_], min_area: int) -> list[NDArray[np.bool_]]:
-        """A mask for each part of an instance that shows enough of itself."""
+        """Return a mask for each part of an instance with at least ``min_area`` visible pixels."""
         here = self._parts[window]
         numbers, areas = np.unique(here[mask], return_counts=True)
         return [here == number for number in numbers[areas >= min_area]]
 
     def neighbours(self, background: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """(n,) which other instance each has the longest common border with; -1 where none touches it."""
+        """Return for each instance the one with the longest common border, (n,); -1 if none touches it."""
         n = len(self.instances)
         borders = np.zeros((n, n), np.int64)
         for one, other in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
@@ -202,7 +201,7 @@ class _View:
 
 
 class _Found:
-    """Collects masks: each is cut into its pieces by chance, its border shifted, and dropped where it is too small."""
+    """The masks of a frame: each may be cut into its pieces, gets its border shifted, and is dropped if too small."""
 
     def __init__(
         self, shape: tuple[int, ...], min_area: int, cut_probability: float, jitter: int, rng: np.random.Generator
@@ -226,7 +225,7 @@ class _Found:
                 self._shift((slice(top, top + height), slice(left, left + width)), piece)
 
     def masks(self) -> Masks:
-        """All masks, in the order of their coming."""
+        """Return all masks, in the order in which they were added."""
         masks = np.zeros((len(self._pieces), *self._shape), bool)
         for target, (window, piece) in zip(masks, self._pieces, strict=True):
             target[window] = piece
@@ -245,7 +244,7 @@ class _Found:
             window = (slice(top, bottom), slice(left, right))
             mask = cv2.dilate(padded, _CROSS, iterations=by).view(bool)
         elif by < 0:
-            # What lies beyond the image may be more of the same: a mask is not eroded from there, but it is from its window.
+            # Erode from the border of the window, but not from that of the image: the object may go on beyond it.
             mask = _eroded(mask, window, self._shape, -by)
         if np.count_nonzero(mask) >= self._min_area:
             self._pieces.append((window, mask))
@@ -255,11 +254,11 @@ def _eroded(mask: NDArray[np.bool_], window: tuple[slice, slice], shape: tuple[i
     y, x = window
     outside = [int(y.start > 0), int(y.stop < shape[0]), int(x.start > 0), int(x.stop < shape[1])]
     padded = cv2.copyMakeBorder(mask.view(np.uint8), *outside, cv2.BORDER_CONSTANT)
-    eroded = cv2.erode(padded, _CROSS, iterations=by)  # Beyond what it is given, OpenCV takes all to be inside.
+    eroded = cv2.erode(padded, _CROSS, iterations=by)  # OpenCV counts everything outside the array as part of the mask.
     return np.asarray(eroded[outside[0] : outside[0] + mask.shape[0], outside[2] : outside[2] + mask.shape[1]], bool)
 
 
 def _span(occupied: NDArray[np.bool_]) -> slice:
-    """From the first to the last place that is occupied."""
+    """Return the slice from the first to the last occupied place."""
     places = np.flatnonzero(occupied)
     return slice(int(places[0]), int(places[-1]) + 1)

@@ -1,1 +1,1 @@
-"""A furnished room with photographs on its walls."""
+"""A simulated furnished room with real photographs on its walls."""

@@ -1,6 +1,6 @@
 """A recording of a furnished room in which real photographs hang on the walls and stand on the furniture.
 
-The room is geometry; what an encoder is asked to recognise are the photographs, real pixels seen through a rendered camera.
+The room is rendered geometry. Encoders are asked to recognise the photographs, whose pixels are real.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ PERIOD_NS = 250_000_000
 
 _HALF_X_M, _HALF_Y_M, _HEIGHT_M = 2.6, 2.3, 2.6
 _EYE_M = 1.25
-_NORTH, _WEST, _SOUTH, _EAST = 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi  # Yaw of a thing with its back to that wall.
+_NORTH, _WEST, _SOUTH, _EAST = 0.0, 0.5 * np.pi, np.pi, -0.5 * np.pi  # Yaw of a thing with its back to each wall.
 
 
 class FurnishedRoom:
-    """A recording of the room: an iterable of posed frames with ground truth.
+    """A recording of the room: an iterable of posed frames, with ground truth.
 
     Attributes:
         intrinsics: Camera model of every frame.
@@ -36,11 +36,11 @@ class FurnishedRoom:
     """
 
     def __init__(self, seed: int = 0, frames: int = 60) -> None:
-        """Build the room and the way through it.
+        """Build the room and the camera path.
 
         Args:
-            seed: Decides textures, books and depth noise; the layout and the path stay.
-            frames: How many frames the way is cut into, first and last at the same place.
+            seed: Seed of textures, books and depth noise; layout and path are always the same.
+            frames: Number of frames along the path; the first and the last are at the same place.
 
         Raises:
             ValueError: Fewer than 2 frames are asked for.
@@ -63,29 +63,29 @@ class FurnishedRoom:
         return list(self._scene.objects)
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Count the frames."""
         return self._frames
 
     def __iter__(self) -> Iterator[PosedFrame]:
-        """The frames in order of time."""
+        """Yield the frames in order of time."""
         return (self.frame(index) for index in range(self._frames))
 
     def pose(self, index: int) -> NDArray[np.float64]:
-        """(4, 4) pose of the optical frame at a frame."""
+        """Return the (4, 4) pose of the optical frame at a frame."""
         return self._path.pose(index / (self._frames - 1))
 
     def rendering(self, index: int) -> Rendering:
-        """The frame without sensor noise, with a label per pixel (1 + index into :attr:`objects`)."""
+        """Render a frame without sensor noise, with a label per pixel (1 + index into :attr:`objects`)."""
         return self._renderer.render(self.intrinsics, self.pose(index))
 
     def frame(self, index: int) -> PosedFrame:
-        """The frame as the sensor sees it; the same whichever frames were asked for before."""
+        """Make a frame as the sensor sees it. It does not depend on the frames made before."""
         view = self.rendering(index)
         depth_m = self._sensor.measure(view.depth_m, view.incidence_cos, np.random.default_rng((self._seed, index)))
         return PosedFrame(EPOCH_NS + index * PERIOD_NS, view.rgb, depth_m, self.intrinsics, self.pose(index))
 
 
-# Each photograph with the two places from which it is looked at, (x, y) in metres, in order of the path.
+# Each photograph with the two places from which it is seen, (x, y) in metres, in order of the path.
 _STOPS: tuple[tuple[str, tuple[float, float], tuple[float, float]], ...] = (
     ("cat", (-0.95, 0.2), (-0.45, 0.3)),
     ("rocket", (0.2, 0.35), (0.65, 0.2)),
@@ -99,7 +99,7 @@ _STOPS: tuple[tuple[str, tuple[float, float], tuple[float, float]], ...] = (
 def _furnish(rng: np.random.Generator) -> Scene:
     builder, palette = SceneBuilder(), furniture.Palette.seeded(rng)
     _shell(builder, palette, rng)
-    # Black frames would make screens of the photographs, to a classifier as to people.
+    # With black frames, photographs would look like screens.
     gilt = Material(textures.wood((150, 116, 60), rng), 0.6)
     walnut = Material(textures.wood((104, 72, 50), rng), 0.6)
 
@@ -136,7 +136,7 @@ def _furnish(rng: np.random.Generator) -> Scene:
 
 
 def _shell(builder: SceneBuilder, palette: furniture.Palette, rng: np.random.Generator) -> None:
-    """Floor, walls, ceiling with a lamp, skirting boards, rug."""
+    """Add floor, walls, ceiling with a lamp, skirting boards and rug."""
     x, y, height = _HALF_X_M, _HALF_Y_M, _HEIGHT_M
     wall = Material(textures.plaster((224, 219, 208), rng), 1.2)
     builder.panel((0, 0, 0), (0, 0, 1), (2 * x, 2 * y), Material(textures.planks((176, 146, 112), rng), 0.9))
@@ -155,7 +155,7 @@ def _shell(builder: SceneBuilder, palette: furniture.Palette, rng: np.random.Gen
 
 
 def _viewpoints(scene: Scene) -> list[Viewpoint]:
-    """Two views of each photograph, clockwise; the camera aims a little below them to see what they stand on."""
+    """List two views of each photograph, clockwise. The camera aims a little below it to see what it stands on."""
     views = []
     for name, *places in _STOPS:
         x, y, z = scene.named(name).center_m.tolist()

@@ -1,7 +1,7 @@
 """Furniture and pictures for simulated rooms.
 
 Every piece stands at a placement: x to its right, y to its back, z up, the origin on the floor in the middle of its back
-edge, so that a piece placed on a wall line with the wall's yaw stands against that wall.
+edge. A piece placed on the line of a wall with the wall's yaw stands against that wall.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from fus3dmaps_lab.simulation.room.scene import Material, Placement, SceneBuilde
 
 @dataclass(frozen=True)
 class Palette:
-    """Materials that a room's furniture shares."""
+    """Materials shared by the furniture of a room."""
 
     light_wood: Material
     dark_wood: Material
@@ -31,7 +31,7 @@ class Palette:
 
     @classmethod
     def seeded(cls, rng: np.random.Generator) -> Palette:
-        """Quiet Scandinavian colours."""
+        """Draw quiet Scandinavian colours."""
         books = ((116, 84, 76), (92, 104, 116), (150, 136, 112), (108, 118, 98), (134, 106, 92), (84, 86, 96))
         return cls(
             light_wood=Material(textures.wood((196, 168, 132), rng), 0.8),
@@ -55,16 +55,16 @@ def picture(
     frame_m: float = 0.04,
     depth_m: float = 0.03,
 ) -> None:
-    """A framed photograph, undistorted, its back on the placement and its lower edge at the placement's height.
+    """Add a framed, undistorted photograph; its back is on the placement, its lower edge at the placement's height.
 
     Args:
-        builder: Where it is added.
+        builder: Scene that gets it.
         photograph: (h, w, 3) uint8.
         width_m: Width of the photograph without its frame; the height follows.
         frame: Look of the frame.
         placement: Middle of the lower edge of the frame's back.
         frame_m: Width of the frame.
-        depth_m: How far the frame stands out; the photograph lies 5 mm behind its front.
+        depth_m: Thickness of the frame; the photograph lies 5 mm behind its front.
     """
     height_m = width_m * photograph.shape[0] / photograph.shape[1]
     half, top = 0.5 * width_m + frame_m, height_m + 2 * frame_m
@@ -81,7 +81,7 @@ def picture(
 
 
 def sofa(builder: SceneBuilder, palette: Palette, placement: Placement, width_m: float = 1.9) -> None:
-    """A sofa with two seats, two arms and two cushions."""
+    """Add a sofa with two seats, two arms and two cushions."""
     half, fabric = 0.5 * width_m, palette.sofa
     builder.box((-half, -0.85, 0.08), (half, -0.05, 0.40), fabric, placement)
     builder.box((-half, -0.25, 0.40), (half, -0.05, 0.82), fabric, placement)
@@ -95,7 +95,7 @@ def sofa(builder: SceneBuilder, palette: Palette, placement: Placement, width_m:
 
 
 def armchair(builder: SceneBuilder, palette: Palette, placement: Placement) -> None:
-    """An armchair."""
+    """Add an armchair."""
     fabric = palette.armchair
     builder.box((-0.38, -0.78, 0.12), (0.38, -0.05, 0.42), fabric, placement)
     builder.box((-0.38, -0.22, 0.42), (0.38, -0.05, 0.86), fabric, placement)
@@ -112,7 +112,7 @@ def table(
     placement: Placement,
     size_m: tuple[float, float, float] = (1.3, 0.65, 0.74),
 ) -> None:
-    """A table with four legs; ``size_m`` is its width, depth and height."""
+    """Add a table with four legs; ``size_m`` is its width, depth and height."""
     width, depth, height = size_m
     half = 0.5 * width
     builder.box((-half, -depth, height - 0.04), (half, 0, height), palette.light_wood, placement)
@@ -128,7 +128,7 @@ def cabinet(
     size_m: tuple[float, float, float] = (1.5, 0.42, 0.72),
     doors: int = 3,
 ) -> None:
-    """A sideboard with doors and handles; ``size_m`` is its width, depth and height."""
+    """Add a sideboard with doors and handles; ``size_m`` is its width, depth and height."""
     width, depth, height = size_m
     half, pitch = 0.5 * width, width / doors
     builder.box((-half, -depth + 0.02, 0.06), (half, 0, height), palette.white, placement)
@@ -154,7 +154,7 @@ def bookshelf(
     size_m: tuple[float, float, float] = (1.1, 0.32, 0.95),
     shelves: int = 2,
 ) -> None:
-    """An open shelf, each compartment partly filled with books; ``size_m`` is its width, depth and height."""
+    """Add an open shelf, each compartment partly filled with books; ``size_m`` is its width, depth and height."""
     width, depth, height = size_m
     half, board = 0.5 * width, 0.025
     pitch = (height - board) / shelves
@@ -175,14 +175,14 @@ def bookshelf(
 
 
 def floor_lamp(builder: SceneBuilder, palette: Palette, placement: Placement, height_m: float = 1.65) -> None:
-    """A standing lamp with a square shade, its pole 0.2 m in front of the placement."""
+    """Add a floor lamp with a square shade, its pole 0.2 m in front of the placement."""
     builder.box((-0.13, -0.33, 0), (0.13, -0.07, 0.025), palette.metal, placement)
     builder.box((-0.012, -0.212, 0.025), (0.012, -0.188, height_m - 0.3), palette.metal, placement)
     builder.box((-0.16, -0.36, height_m - 0.3), (0.16, -0.04, height_m), palette.shade, placement)
 
 
 def door(builder: SceneBuilder, palette: Palette, placement: Placement) -> None:
-    """A closed door with its frame and handle."""
+    """Add a closed door with its frame and handle."""
     builder.box((-0.49, -0.03, 0), (0.49, 0, 2.09), palette.white, placement)
     builder.box((-0.42, -0.05, 0.005), (0.42, -0.03, 2.02), palette.light_wood, placement)
     builder.box((0.28, -0.10, 1.0), (0.38, -0.05, 1.03), palette.metal, placement)

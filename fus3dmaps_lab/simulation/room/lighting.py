@@ -1,7 +1,7 @@
-"""Light and soft shadow on the surfaces of a scene, worked out once before anything is rendered.
+"""Light and soft shadows on the surfaces of a scene, computed once before rendering.
 
 Every rectangle gets a coarse grid of brightness factors: direct light of the lamps, with shadow rays to points spread over
-each lamp, plus ambient light dimmed by how close the surroundings are (ambient occlusion).
+each lamp, plus ambient light that is dimmed where other surfaces are close (ambient occlusion).
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ _LAMP_GRID = 4
 
 
 def bake_light(panels: Sequence[Panel], caster: o3d.t.geometry.RaycastingScene) -> list[NDArray[np.float32]]:
-    """Brightness factors over every rectangle.
+    """Compute the brightness factors of every rectangle.
 
     Args:
         panels: All rectangles of the scene.
         caster: The same rectangles, ready for ray casting.
 
     Returns:
-        One (rows, columns) float32 grid for each rectangle, its cells spread evenly over it in texture coordinates;
-        1 is the brightness at which a texture shows its own colours. Rectangles that are not lit hold ones.
+        One (rows, columns) float32 grid for each rectangle, its cells spread evenly over it in texture coordinates.
+        At 1 a texture shows its own colours. Rectangles that are not lit have ones.
     """
     shapes = [_grid_shape(panel) if panel.material.lit else (1, 1) for panel in panels]
     lit = [index for index, panel in enumerate(panels) if panel.material.lit]
@@ -66,13 +66,13 @@ def _grid_shape(panel: Panel) -> tuple[int, int]:
 def _ambient(
     point: NDArray[np.float64], normal: NDArray[np.float64], caster: o3d.t.geometry.RaycastingScene
 ) -> NDArray[np.float64]:
-    """Cosine-weighted share of the surroundings that is not close by, times the ambient light."""
+    """Compute the ambient light times the cosine-weighted share of the surroundings that is not close by."""
     helper = np.where(np.abs(normal[:, 2:]) > 0.9, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]])
     tangent = np.cross(helper, normal)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     bitangent = np.cross(normal, tangent)
     openness = np.zeros(len(point))
-    for k in range(_AMBIENT_RAYS):  # A sunflower disc lifted onto the hemisphere is cosine weighted.
+    for k in range(_AMBIENT_RAYS):  # A sunflower disc projected onto the hemisphere is cosine weighted.
         radius, angle = np.sqrt((k + 0.5) / _AMBIENT_RAYS), k * np.pi * (3 - np.sqrt(5))
         x, y, z = radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - radius**2)
         rays = np.hstack([point, x * tangent + y * bitangent + z * normal]).astype(np.float32)
@@ -84,7 +84,7 @@ def _ambient(
 def _direct(
     point: NDArray[np.float64], normal: NDArray[np.float64], lamp: Panel, caster: o3d.t.geometry.RaycastingScene
 ) -> NDArray[np.float64]:
-    """Light that reaches the points straight from one lamp."""
+    """Compute the light that reaches the points directly from one lamp."""
     width, height = lamp.size_m
     share = lamp.material.emission * width * height / _LAMP_GRID**2 / np.pi
     total = np.zeros(len(point))

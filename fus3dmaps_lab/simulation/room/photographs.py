@@ -1,8 +1,8 @@
-"""Real photographs that lie inside the scikit-image wheel; none of them is downloaded.
+"""Real photographs from the scikit-image wheel; none of them is downloaded.
 
-As scikit-image states: the cat, the espresso and the man with the camera are CC0 (Stéfan van der Walt, Rachel Michetti, Lav
-Varshney), the rocket (SpaceX) and the astronaut (NASA) in the public domain. The motorcycle is from the Middlebury 2014
-stereo benchmark (Scharstein et al.), for which it names no licence.
+According to scikit-image, the cat, the espresso and the man with the camera are CC0 (Stéfan van der Walt, Rachel Michetti,
+Lav Varshney), the rocket (SpaceX) and the astronaut (NASA) in the public domain. The motorcycle is from the Middlebury
+2014 stereo benchmark (Scharstein et al.), for which it names no licence.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ FILES = {
     "rocket": "rocket.jpg",
 }
 
-# What is cut away (top, bottom, left, right pixels) where the subject is small in its picture.
+# Pixels cut away (top, bottom, left, right) from pictures with a small subject.
 _TRIMS = {"rocket": (40, 0, 120, 120)}
 
 
 def photograph(name: str) -> NDArray[np.uint8]:
-    """One of the photographs of :data:`FILES`.
+    """Read one of the photographs of :data:`FILES`.
 
     Returns:
         (h, w, 3) uint8 RGB, upright.
 
     Raises:
-        RecordingError: scikit-image is not installed, or its wheel came without that file.
+        RecordingError: scikit-image is not installed, or its wheel has no such file.
     """
     spec = find_spec("skimage")
     if spec is None or spec.origin is None:

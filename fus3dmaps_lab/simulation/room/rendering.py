@@ -1,4 +1,4 @@
-"""Colour, depth and labels of a scene as a pinhole camera sees it, by ray casting."""
+"""Rendering of colour, depth and labels of a scene by ray casting."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from fus3dmaps_lab.simulation.room.texture_atlas import MipAtlas, pack
 
 _SUBPIXELS = np.array([(-0.375, -0.125), (0.125, -0.375), (0.375, 0.125), (-0.125, 0.375)], np.float32)
 
-_BELOW_ONE = np.float32(1 - 2**-23)  # At 1 a texture that repeats would begin again.
+_BELOW_ONE = np.float32(1 - 2**-23)  # At 1 a repeating texture would begin again.
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class Rendering:
 
 
 class SceneRenderer:
-    """Renders one scene from any pose; equal inputs give equal bits.
+    """Renders views of one scene; equal inputs give equal bits.
 
     Textures are sampled at the size of the pixel's footprint, and pixels on the edge of a surface average four rays.
     """
 
     def __init__(self, scene: Scene) -> None:
-        """Prepare ray casting, textures and light, which takes a second for a furnished room."""
+        """Prepare ray casting, textures and light; this takes a second for a furnished room."""
         panels = scene.panels
         corners = np.stack([panel.point_m([0, 1, 0, 1], [0, 0, 1, 1]) for panel in panels])
         # Barycentric coordinates of the first triangle are (u, v), of the second (1 - u, 1 - v).
@@ -96,7 +96,7 @@ class SceneRenderer:
     def _trace(
         self, directions: NDArray[np.float32], intrinsics: Intrinsics, T_world_camera: NDArray[np.float64]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-        """Colour, depth, rectangle (-1: none) and |normal . direction| for rays (x, y, 1) of the optical frame."""
+        """Cast rays (x, y, 1) of the optical frame; return colour, depth, rectangle (-1: none) and |normal . direction|."""
         R = T_world_camera[:3, :3]
         rays = np.empty((len(directions), 6), np.float32)
         rays[:, :3] = T_world_camera[:3, 3]
@@ -132,7 +132,7 @@ def _fraction(value: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _edges(panel: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Pixels with another rectangle among their four neighbours."""
+    """Find the pixels with another rectangle among their four neighbours."""
     index = panel.astype(np.float32)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     edges: NDArray[np.bool_] = cv2.dilate(index, cross) != cv2.erode(index, cross)
@@ -141,7 +141,7 @@ def _edges(panel: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 @lru_cache(maxsize=4)
 def _directions(intrinsics: Intrinsics) -> NDArray[np.float32]:
-    """(H * W, 3) rays (x, y, 1) through the pixel centres, row by row."""
+    """Return the (H * W, 3) rays (x, y, 1) through the pixel centres, row by row."""
     y, x = np.mgrid[: intrinsics.height, : intrinsics.width]
     directions = np.stack(
         [(x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy, np.ones_like(x)], axis=-1

@@ -1,7 +1,7 @@
-"""A scene of textured rectangles and what is in it: the pieces that rooms and buildings are put together from.
+"""A scene made of textured rectangles, and the objects in it.
 
-Frames: world x east, y north, z up, metres. A rectangle is seen from its front; a texture on it reads like a picture on a
-wall (upright, not mirrored) from there.
+Frames: world x east, y north, z up, metres. Seen from the front of its rectangle, a texture looks like a picture on a wall:
+upright and not mirrored.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Material:
     Attributes:
         texture: (h, w, 3) uint8.
         tile_m: Edge of one repeat of the texture, metres; None stretches it once over the rectangle.
-        lit: Whether light and shadow change its brightness; prints and lamps keep theirs.
+        lit: Whether light and shadow change its brightness; they do not for prints and lamps.
         emission: Radiance as a lamp, in units of the ambient light; 0 gives none.
     """
 
@@ -39,7 +39,7 @@ class Panel:
 
     Attributes:
         origin_m: (3,) the corner where the texture's first row and column are.
-        edge_u_m: (3,) from there along the texture's rows, to the right for who faces it.
+        edge_u_m: (3,) from there along the texture's rows, to the right as seen from its front.
         edge_v_m: (3,) from there along the texture's columns, downwards; orthogonal to ``edge_u_m``.
         material: Its look.
         label: 0 for the building itself, else 1 + the index of its object in :attr:`Scene.objects`.
@@ -53,23 +53,23 @@ class Panel:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Lengths of the two edges."""
+        """Lengths of the two edges, metres."""
         return float(np.linalg.norm(self.edge_u_m)), float(np.linalg.norm(self.edge_v_m))
 
     @property
     def normal(self) -> NDArray[np.float64]:
-        """Unit vector towards whoever faces it."""
+        """Unit normal of its front."""
         normal = np.cross(self.edge_v_m, self.edge_u_m)
         return normal / np.linalg.norm(normal)
 
     def point_m(self, u: ArrayLike, v: ArrayLike) -> NDArray[np.float64]:
-        """(..., 3) points at the texture coordinates ``u`` and ``v`` in [0, 1]."""
+        """Return the (..., 3) points at texture coordinates ``u`` and ``v`` in [0, 1]."""
         return self.origin_m + np.asarray(u)[..., None] * self.edge_u_m + np.asarray(v)[..., None] * self.edge_v_m
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """Ground truth of one thing in a scene.
+    """Ground truth of one object in a scene.
 
     Attributes:
         name: Unique within the scene.
@@ -86,18 +86,18 @@ class SceneObject:
 
 @dataclass(frozen=True)
 class Scene:
-    """Rectangles and the objects they belong to.
+    """Rectangles and the objects that they belong to.
 
     Attributes:
         panels: Every rectangle.
-        objects: The things among them; ``panels[...].label`` counts from 1 in this order.
+        objects: The objects; ``panels[...].label`` counts them from 1 in this order.
     """
 
     panels: list[Panel]
     objects: list[SceneObject]
 
     def named(self, name: str) -> SceneObject:
-        """The object of that name.
+        """Return the object with a name.
 
         Raises:
             KeyError: There is none.
@@ -110,23 +110,23 @@ class Scene:
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a thing stands: its local frame has x to the right, y to its back, z up.
+    """Place of a thing. Its local frame has x to the right, y to its back, z up.
 
     Attributes:
         position_m: World coordinates of the local origin.
-        yaw_rad: Turn about z; at 0 the thing faces south and its back is to the north.
+        yaw_rad: Turn about z; at 0 the thing faces south, its back to the north.
     """
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     yaw_rad: float = 0.0
 
     def rotate(self, vector: ArrayLike) -> NDArray[np.float64]:
-        """A local direction in world coordinates."""
+        """Turn a local direction into world coordinates."""
         cosine, sine = np.cos(self.yaw_rad), np.sin(self.yaw_rad)
         return np.array([[cosine, -sine, 0], [sine, cosine, 0], [0, 0, 1]]) @ np.asarray(vector, np.float64)
 
     def transform(self, point_m: ArrayLike) -> NDArray[np.float64]:
-        """A local point in world coordinates."""
+        """Turn a local point into world coordinates."""
         return np.asarray(self.position_m) + self.rotate(point_m)
 
 
@@ -135,7 +135,7 @@ WORLD = Placement()
 
 @dataclass
 class SceneBuilder:
-    """Collects rectangles; those added inside ``with builder.thing(name)`` make one object of the ground truth."""
+    """Builds a scene. Rectangles added inside ``with builder.thing(name)`` form one object of the ground truth."""
 
     _panels: list[Panel] = field(default_factory=list)
     _names: list[str] = field(default_factory=list)
@@ -143,7 +143,7 @@ class SceneBuilder:
 
     @contextmanager
     def thing(self, name: str) -> Iterator[None]:
-        """Give everything added inside to one object.
+        """Make one object of everything added inside the ``with`` block.
 
         Raises:
             ValueError: The name is taken, or another thing is still open.
@@ -171,11 +171,10 @@ class SceneBuilder:
 
         Args:
             center_m: (3,) local coordinates of its centre.
-            facing: (3,) local normal. Vertical faces carry their texture upright; horizontal ones with its right to
-                local x.
-            size_m: Width and height as seen by whoever faces it.
+            facing: (3,) local normal. Textures are upright on vertical faces; on horizontal ones their right is local x.
+            size_m: Width and height as seen from its front.
             material: Its look.
-            placement: Where the local frame is.
+            placement: Place of the local frame.
         """
         normal = np.asarray(facing, np.float64) / np.linalg.norm(facing)
         right = np.array([1.0, 0.0, 0.0]) if abs(normal @ UP) > 0.999 else np.cross(-normal, UP)
@@ -200,8 +199,8 @@ class SceneBuilder:
             low_m: (3,) lower corner, local.
             high_m: (3,) upper corner, local.
             material: Look of every face.
-            placement: Where the local frame is.
-            inward: The faces look inwards, as those of a room do.
+            placement: Place of the local frame.
+            inward: Whether the faces look inwards, like those of a room.
         """
         low, high = np.asarray(low_m, np.float64), np.asarray(high_m, np.float64)
         center, size = 0.5 * (low + high), high - low
@@ -214,7 +213,7 @@ class SceneBuilder:
                 self.panel(center + 0.5 * size * outward, facing, (float(face[0]), float(face[1])), material, placement)
 
     def build(self) -> Scene:
-        """The scene so far.
+        """Return the scene of everything added so far.
 
         Raises:
             ValueError: A thing has no surface.

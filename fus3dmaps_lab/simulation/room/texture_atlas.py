@@ -1,4 +1,4 @@
-"""Many textures, each with its half, quarter, ... sizes, in one image that can be sampled at any position at once."""
+"""An atlas: many textures with their half, quarter, ... sizes in one image, sampled at any positions in one call."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-_PADDING = 2  # Bilinear taps reach one texel beyond a texture; the second hides OpenCV's fixed-point coordinates.
+_PADDING = 2  # Bilinear sampling reaches one texel beyond a texture; the second covers OpenCV's fixed-point coordinates.
 _CHUNK = 512  # cv2.remap refuses maps longer than 32,767 in either direction, so flat lists are folded to this width.
 
 
 @dataclass(frozen=True)
 class Tiles:
-    """Where the packed images are.
+    """Places of the packed images in an atlas.
 
     Attributes:
         image: The atlas, (h, w) or (h, w, channels).
@@ -33,10 +33,10 @@ class Tiles:
     height: NDArray[np.float32]
 
     def sample(self, tile: NDArray[np.integer], u: NDArray[np.float32], v: NDArray[np.float32]) -> NDArray[Any]:
-        """Bilinear samples.
+        """Sample the images bilinearly.
 
         Args:
-            tile: (n,) which image.
+            tile: (n,) index of the image.
             u: (n,) in [0, 1], left edge to right edge.
             v: (n,) in [0, 1], top edge to bottom edge.
 
@@ -58,7 +58,7 @@ def pack(images: Sequence[NDArray[Any]], repeats: Sequence[bool]) -> Tiles:
 
     Args:
         images: (h, w) or (h, w, channels) each.
-        repeats: Whether an image continues with its other side (a repeated texture) or with its own edge.
+        repeats: Whether an image continues with its opposite side (a repeating texture) or with its own edge.
     """
     padded = [
         cv2.copyMakeBorder(image, *(4 * [_PADDING]), cv2.BORDER_WRAP if repeat else cv2.BORDER_REPLICATE)
@@ -87,10 +87,10 @@ def pack(images: Sequence[NDArray[Any]], repeats: Sequence[bool]) -> Tiles:
 
 
 class MipAtlas:
-    """Textures sampled at the size of a pixel's footprint (trilinear mip-mapping), so that none of them glitters."""
+    """Textures that are sampled at the size of a pixel's footprint (trilinear mip-mapping), which avoids glitter."""
 
     def __init__(self, textures: Sequence[NDArray[np.uint8]], repeats: Sequence[bool]) -> None:
-        """Pack every texture with all of its smaller sizes; ``repeats`` as :func:`pack`."""
+        """Pack every texture with all of its smaller sizes; ``repeats`` as in :func:`pack`."""
         images: list[NDArray[np.uint8]] = []
         wraps: list[bool] = []
         first, levels = [], []
@@ -114,13 +114,13 @@ class MipAtlas:
         v: NDArray[np.float32],
         level: NDArray[np.float32],
     ) -> NDArray[np.float32]:
-        """Samples of textures at a level of detail.
+        """Sample textures at a level of detail.
 
         Args:
             texture: (n,) index of the texture.
             u: (n,) in [0, 1].
             v: (n,) in [0, 1].
-            level: (n,) log2 of the texels per pixel, of the full-size texture; clipped to what exists.
+            level: (n,) log2 of texels per pixel at full size; clipped to the existing sizes.
 
         Returns:
             (n, 3) float32 in [0, 255].

@@ -1,4 +1,4 @@
-"""Procedural textures of quiet surfaces: low contrast, repeatable on every side, seeded."""
+"""Procedural, seeded textures of low contrast that repeat on every side."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ _SIZE = 256
 
 
 def plain(color: Color) -> NDArray[np.uint8]:
-    """One colour, (4, 4, 3) uint8."""
+    """Make a texture of one colour, (4, 4, 3) uint8."""
     return np.full((4, 4, 3), color, np.uint8)
 
 
 def plaster(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Painted wall: soft blotches of a few grey values."""
+    """Make a painted wall: soft blotches of a few grey values."""
     return _shaded(color, 0.7 * _noise(rng, 20.0, 20.0) + 0.7 * _noise(rng, 1.0, 1.0))
 
 
 def fabric(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Woven cloth: fine threads both ways."""
+    """Make woven cloth: fine threads both ways."""
     return _shaded(color, 2.5 * _noise(rng, 0.7, 5.0) + 2.5 * _noise(rng, 5.0, 0.7) + 1.5 * _noise(rng, 16.0, 16.0))
 
 
 def wood(color: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A board with its grain along the rows."""
+    """Make a board with its grain along the rows."""
     return _shaded(color, 4.0 * _noise(rng, 50.0, 1.5) + 1.5 * _noise(rng, 10.0, 0.7))
 
 
 def planks(color: Color, rng: np.random.Generator, rows: int = 4) -> NDArray[np.uint8]:
-    """A floor of boards along the rows, each a little lighter or darker, with faint joints."""
+    """Make a floor of boards along the rows, each a little lighter or darker, with faint joints."""
     height = _SIZE // rows
     shade = 4.0 * _noise(rng, 60.0, 1.5) + 1.5 * _noise(rng, 10.0, 0.7)
     for row in range(rows):
@@ -45,7 +45,7 @@ def planks(color: Color, rng: np.random.Generator, rows: int = 4) -> NDArray[np.
 
 
 def rug(color: Color, border: Color, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """A rug with a border, to be stretched over a rectangle."""
+    """Make a rug with a border, to be stretched over a rectangle."""
     texture = fabric(color, rng)
     edge = fabric(border, rng)
     inner = slice(_SIZE // 14, -_SIZE // 14)
@@ -54,7 +54,7 @@ def rug(color: Color, border: Color, rng: np.random.Generator) -> NDArray[np.uin
 
 
 def _noise(rng: np.random.Generator, sigma_x: float, sigma_y: float) -> NDArray[np.float32]:
-    """Unit-variance Gaussian noise of a given grain that repeats on every side."""
+    """Draw unit-variance Gaussian noise of a given grain that repeats on every side."""
     field = np.tile(rng.standard_normal((_SIZE, _SIZE), np.float32), (3, 3))
     smooth = cv2.GaussianBlur(field, (0, 0), sigmaX=sigma_x, sigmaY=sigma_y)[_SIZE : 2 * _SIZE, _SIZE : 2 * _SIZE]
     result: NDArray[np.float32] = smooth / smooth.std()

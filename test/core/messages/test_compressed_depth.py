@@ -1,4 +1,4 @@
-"""Compressed depth images against what plain encoders made of known depth; what is cut, damaged or no depth is refused."""
+"""Compressed depth images against plain encoders of known depth; truncated, damaged and other images are refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from reference.depth_codes import png, quantised, transport
 
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
+from fus3dmaps_core.messages import images
 
 PLAIN = ["png", "16UC1; png compressed ", "16UC1; png compressed", "mono16; png compressed "]
 TRANSPORT_16_BIT = {
@@ -45,13 +45,13 @@ def millimetres(rng) -> np.ndarray:
 def test_16_bit_depth_comes_back_exactly(text, millimetres):
     code = TRANSPORT_16_BIT.get(text)
     message = compressed(text, transport(millimetres, code) if code else png(millimetres))
-    messages.check_depth(message, "/depth")
-    assert messages.image_size(message, "/depth") == (7, 5)
-    depth_m = messages.decode_depth(message, "/depth", 0.001)
-    raw = messages.decode_depth(ros.image(0, "16UC1", millimetres), "/depth", 0.001)
+    images.check_depth(message, "/depth")
+    assert images.image_size(message, "/depth") == (7, 5)
+    depth_m = images.decode_depth(message, "/depth", 0.001)
+    raw = images.decode_depth(ros.image(0, "16UC1", millimetres), "/depth", 0.001)
     assert depth_m.dtype == np.float32
     np.testing.assert_array_equal(depth_m, raw)
-    np.testing.assert_allclose(messages.decode_depth(message, "/depth", 0.0002), millimetres * 0.0002, rtol=1e-6)
+    np.testing.assert_allclose(images.decode_depth(message, "/depth", 0.0002), millimetres * 0.0002, rtol=1e-6)
 
 
 @pytest.mark.parametrize("text", TRANSPORT_FLOAT)
@@ -60,8 +60,8 @@ def test_float_depth_comes_back_to_within_its_quantisation(text, rng):
     depth_m[0, :3] = np.nan, np.inf, 10.5
     stored, a, b = quantised(depth_m, DEPTH_MAX_M, QUANTISATION)
     message = compressed(text, transport(stored, TRANSPORT_FLOAT[text], a, b))
-    messages.check_depth(message, "/depth")
-    decoded = messages.decode_depth(message, "/depth", 0.001)
+    images.check_depth(message, "/depth")
+    decoded = images.decode_depth(message, "/depth", 0.001)
     assert decoded.dtype == np.float32
     assert np.isnan(decoded[0, :3]).all()
     # Cutting to an integer moves A / depth by less than 1, and so depth by less than depth^2 / A, and only away.
@@ -76,7 +76,7 @@ def test_float_depth_comes_back_to_within_its_quantisation(text, rng):
 def test_inverse_depth_worked_out_by_hand():
     message = compressed("32FC1; compressedDepth rvl", transport(np.array([[0, 3, 25, 1]], np.uint16), "rvl", 50.0, 5.0))
     # 50 / (25 - 5); at or under B = 5 there is nothing.
-    np.testing.assert_array_equal(messages.decode_depth(message, "/depth", 1.0), np.float32([[np.nan, np.nan, 2.5, np.nan]]))
+    np.testing.assert_array_equal(images.decode_depth(message, "/depth", 1.0), np.float32([[np.nan, np.nan, 2.5, np.nan]]))
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_inverse_depth_worked_out_by_hand():
      "16UC1; compressedDepth zstd", "8UC1; compressedDepth png", "compressedDepth png"],
 )  # fmt: skip
 def test_unknown_formats_are_refused(text, millimetres):
-    for call in (messages.check_depth, decode):
+    for call in (images.check_depth, decode):
         assert_refused(call, compressed(text, transport(millimetres, "png")), "unknown_encoding")
 
 
@@ -101,7 +101,7 @@ def test_unknown_formats_are_refused(text, millimetres):
 )
 def test_images_that_are_no_16_bit_png_are_refused(image, reason):
     for message in (compressed("png", image), compressed("16UC1; compressedDepth png", bytes(12) + image)):
-        assert_refused(messages.check_depth, message, reason)
+        assert_refused(images.check_depth, message, reason)
         assert_refused(decode, message, reason)
 
 
@@ -109,14 +109,14 @@ def test_images_that_are_no_16_bit_png_are_refused(image, reason):
 def test_quantisation_that_is_none_is_refused(a, b, millimetres):
     for code in ("png", "rvl"):
         message = compressed(f"32FC1; compressedDepth {code}", transport(millimetres, code, a, b))
-        assert_refused(messages.check_depth, message, "bad_compression")
+        assert_refused(images.check_depth, message, "bad_compression")
 
 
 @pytest.mark.parametrize(("width", "height"), [(0, 5), (5, 0), (2**31, 2**31), (2**16, 2**16)])
 def test_sizes_that_are_none_are_refused(width, height, millimetres):
     good = transport(millimetres, "rvl")
     message = compressed("16UC1; compressedDepth rvl", good[:12] + struct.pack("<II", width, height) + good[20:])
-    for call in (messages.check_depth, messages.image_size, decode):
+    for call in (images.check_depth, images.image_size, decode):
         assert_refused(call, message, "bad_image")
 
 
@@ -144,11 +144,11 @@ def test_flipped_bits_give_an_image_or_a_refusal(image, text, data):
     except FrameError as error:
         outcome = error.reason
     refusals = ("bad_compression", "bad_image", "unknown_encoding")
-    assert outcome in refusals or outcome == messages.image_size(message, "/depth")
+    assert outcome in refusals or outcome == images.image_size(message, "/depth")
 
 
 def decode(message, topic: str) -> np.ndarray:
-    return messages.decode_depth(message, topic, 0.001)
+    return images.decode_depth(message, topic, 0.001)
 
 
 def assert_refused(call, message, reason: str) -> None:

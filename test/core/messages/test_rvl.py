@@ -1,4 +1,4 @@
-"""The RVL decoder against code worked out by hand and a plain encoder; what is cut or damaged is refused."""
+"""The RVL decoder against code worked out by hand and a plain encoder; truncated and damaged code is refused."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ COUNTS = {"/depth/image": 20, "/pose": 20, "/rgb/camera_info": 20, "/rgb/image":
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Twenty frames in two chunks."""
+    """Write twenty frames in two chunks."""
     path = tmp_path_factory.mktemp("recording") / "bag.mcap"
     with RecordingWriter(path) as writer:
         for frame in noise_frames(20):
@@ -25,7 +25,7 @@ def recording(tmp_path_factory):
 
 
 def as_directory(source, directory, plugin):
-    """The same messages as rosbags writes a rosbag2 directory."""
+    """Write the same messages with rosbags as a rosbag2 directory."""
     typestore = get_typestore(Stores.ROS2_JAZZY)
     with RecordingReader(source) as reader, Writer(directory, version=9, storage_plugin=plugin) as writer:
         connections = {
@@ -71,7 +71,7 @@ def test_directories_and_their_files_hold_the_same(recording, tmp_path, plugin):
 
 
 def test_directory_of_a_killed_recorder(recording, tmp_path):
-    """No metadata.yaml, one complete file and one that breaks off."""
+    """There is no metadata.yaml, one complete file and one truncated file."""
     data = recording.read_bytes()
     (tmp_path / "bag_9.mcap").write_bytes(data)
     (tmp_path / "bag_10.mcap").write_bytes(data[: len(data) * 2 // 3])

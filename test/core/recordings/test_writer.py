@@ -1,4 +1,4 @@
-"""Recordings as other readers see them: mcap's own, rosbags, and the format's conventions."""
+"""Recordings read by other readers (mcap's own, rosbags), and the conventions of the format."""
 
 from __future__ import annotations
 

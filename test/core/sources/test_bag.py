@@ -1,4 +1,4 @@
-"""Recordings to posed frames: the round trip, odd and damaged recordings, and the counts of what was dropped."""
+"""Recordings to posed frames: the round trip, unusual and damaged recordings, and counts of drops."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.config.schema import ImageConfig
 from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.frame import PosedFrame
+from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.sources.bag import BagSource
 
@@ -29,7 +30,7 @@ def write(path, frames, config=None):
 
 
 def write_messages(path, messages):
-    """A recording of (topic, log time, message or raw bytes with their type)."""
+    """Write a recording of (topic, log time, message or raw bytes with their type)."""
     with path.open("wb") as stream:
         writer = Writer(stream)
         writer.start("ros2", "test")
@@ -75,19 +76,17 @@ def recording(tmp_path_factory, frames):
 def test_frames_survive_the_round_trip(tmp_path, frames, config):
     with BagSource(write(tmp_path / "bag.mcap", frames[:5], config), config) as source:
         assert len(source) == 5
-        assert source.messages_total == 20
-        assert source.duration_s == pytest.approx(0.4)
         for _ in range(2):  # Each iteration starts anew.
             assert_same_frames([paired.decode(ImageConfig()) for paired in source], frames[:5])
-            assert source.messages_read == 20
             assert not source.pairer.drops
-            assert source.pairer.received["pose" if config.pose_topic == "pose" else config.pose_topic] == 5
 
 
-def test_frames_come_while_reading(recording):
+def test_frames_come_while_reading(recording, monkeypatch):
+    read, deserialize = [], RecordingReader.deserialize
+    monkeypatch.setattr(RecordingReader, "deserialize", lambda reader, raw: read.append(raw) or deserialize(reader, raw))
     with BagSource(recording, InputConfig()) as source:
         next(iter(source))
-        assert source.messages_read == 4
+        assert len(read) == 4
 
 
 @pytest.mark.parametrize("share", [0.55, 0.8, 0.9999])
@@ -223,7 +222,6 @@ def test_poses_from_the_transforms_of_a_recording(tmp_path):
         for _ in range(2):  # Each iteration starts anew.
             assert [paired.T_world_camera[:2, 3].tolist() for paired in source] == [[1.0, 3.0], [2.0, 3.0]]
             assert source.pairer.drops == {"bad_transform": 1}
-            assert source.messages_read == source.messages_total == len(messages)
 
 
 def test_a_recording_without_transforms_is_refused(recording):

@@ -1,4 +1,4 @@
-"""What a camera is: its model over time, its lens, its separate depth sensor, its transports; and several of them."""
+"""Cameras: the model over time, lens, separate depth sensor and transports, and several cameras."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import ros_messages as ros
 from compressed_messages import compressed_depth_png, compressed_depth_rvl, depth_png, jpeg, png
+from fed_pairer import FedPairer
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -15,7 +16,6 @@ from fus3dmaps_core.config.schema import Config, ImageConfig
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.frame import Intrinsics
 from fus3dmaps_core.geometry.registration import register_depth
-from fus3dmaps_core.sources.pairing import FramePairer
 from fus3dmaps_core.sources.transforms import TransformTree
 
 MS = 1_000_000
@@ -25,7 +25,7 @@ IDENTITY = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]
 RNG = np.random.default_rng(3)
 
 
-def see(pairer: FramePairer, stamp_ns: int, rgb=None, depth=None, camera: int = 0) -> None:
+def see(pairer: FedPairer, stamp_ns: int, rgb=None, depth=None, camera: int = 0) -> None:
     pairer.add_depth(ros.image(stamp_ns, "16UC1") if depth is None else depth, camera)
     pairer.add_rgb(ros.image(stamp_ns) if rgb is None else rgb, camera)
 
@@ -52,7 +52,7 @@ DEPTH_MM = RNG.integers(500, 4000, (48, 64)).astype(np.uint16)
     ],
 )
 def test_compressed_images_meet_like_raw_ones(rgb_transport, compress, exact, depth_transport, compress_depth):
-    pairer = FramePairer(InputConfig(rgb_transport=rgb_transport, depth_transport=depth_transport))
+    pairer = FedPairer(InputConfig(rgb_transport=rgb_transport, depth_transport=depth_transport))
     topics = {stream.parameter: (stream.topic, stream.msgtype) for stream in pairer.streams()}
     assert topics["input.rgb_topic"] == ("rgb/image/compressed", "sensor_msgs/msg/CompressedImage")
     assert topics["input.depth_topic"] == (f"depth/image/{depth_transport}", "sensor_msgs/msg/CompressedImage")
@@ -70,12 +70,12 @@ def test_compressed_images_meet_like_raw_ones(rgb_transport, compress, exact, de
 
 
 def test_a_topic_that_has_its_suffix_keeps_it():
-    pairer = FramePairer(InputConfig(rgb_topic="/cam/image_raw/compressed", rgb_transport="compressed"))
+    pairer = FedPairer(InputConfig(rgb_topic="/cam/image_raw/compressed", rgb_transport="compressed"))
     assert next(stream.topic for stream in pairer.streams()) == "/cam/image_raw/compressed"
 
 
 def test_a_truncated_image_is_counted_by_name():
-    pairer = FramePairer(InputConfig(rgb_transport="compressed"))
+    pairer = FedPairer(InputConfig(rgb_transport="compressed"))
     image_format, data = jpeg(COLORS)
     pairer.add_rgb(ros.compressed(START, image_format, data[:100]))
     assert pairer.drops == {"bad_compression": 1}
@@ -87,7 +87,7 @@ def test_a_truncated_image_is_counted_by_name():
 def test_distortion_is_undone_once_wanted(rectify, scale):
     """Depth of half the resolution is rectified with the same lens."""
     d = (-0.2, 0.05, 0.001, -0.002, 0.0)
-    pairer = FramePairer(InputConfig(rectify=rectify))
+    pairer = FedPairer(InputConfig(rectify=rectify))
     pairer.add_camera_info(info(d=d))
     pairer.add_pose(ros.pose(START))
     depth_mm = DEPTH_MM[::scale, ::scale]
@@ -119,7 +119,7 @@ def test_depth_of_another_camera_is_registered(source):
     )
     tree = TransformTree(1.0)
     tree.add(ros.transforms(("camera", "ir", 0, (0.2, 0.0, 0.0))), "/tf_static", static=True)
-    pairer = FramePairer(config, tree)
+    pairer = FedPairer(config, tree)
     assert "depth/camera_info" in [stream.topic for stream in pairer.streams()]
     depth_mm = np.full((30, 30), 1000, np.uint16)
     depth = ros.image(START, "16UC1", depth_mm)
@@ -141,7 +141,7 @@ def test_depth_of_another_camera_is_registered(source):
 
 
 def test_the_model_of_a_depth_camera_that_never_comes_is_named():
-    pairer = FramePairer(InputConfig(depth_registered=False))
+    pairer = FedPairer(InputConfig(depth_registered=False))
     pairer.add_pose(ros.pose(START))
     pairer.add_camera_info(info())
     see(pairer, START, ros.image(START, "rgb8", COLORS), ros.image(START, "16UC1", DEPTH_MM))
@@ -150,7 +150,7 @@ def test_the_model_of_a_depth_camera_that_never_comes_is_named():
 
 
 def test_a_changed_model_holds_from_its_stamp_on():
-    pairer = FramePairer(InputConfig())
+    pairer = FedPairer(InputConfig())
     pairer.add_camera_info(ros.camera_info(START, focal=5.0))
     pairer.add_camera_info(ros.camera_info(START + 90 * MS, focal=5.0))
     see(pairer, START)
@@ -167,7 +167,7 @@ def test_a_changed_model_holds_from_its_stamp_on():
 
 
 def test_a_frame_that_changes_is_counted_once_and_followed():
-    pairer = FramePairer(InputConfig())
+    pairer = FedPairer(InputConfig())
     pairer.add_camera_info(ros.camera_info())
     for i in range(4):
         stamp_ns = START + i * 100 * MS
@@ -180,8 +180,8 @@ def test_a_frame_that_changes_is_counted_once_and_followed():
     assert "'camera' to 'other'" in pairer.last_drop["frame_id_changed"]
 
 
-def two_cameras(**values) -> FramePairer:
-    pairer = FramePairer(
+def two_cameras(**values) -> FedPairer:
+    pairer = FedPairer(
         InputConfig(cameras="front, rear", T_body_camera=[*IDENTITY, 0.0, 5.0, 0.0, 0.0, 0.0, 0.0, 1.0], **values)
     )
     for camera in (0, 1):
@@ -206,7 +206,7 @@ def test_each_camera_has_its_namespace_and_its_mounting():
 
 @given(front=st.sets(st.integers(0, 60)), rear=st.sets(st.integers(0, 60)), order=st.randoms(), delay=st.integers(0, 10))
 def test_frames_of_cameras_interleave_by_stamp(front, rear, order, delay):
-    """Depth comes late, each camera's at its own time; all frames come, and none before an earlier one that was there."""
+    """Depth is late by a different time for each camera. All frames come, and none before an earlier one that was there."""
     pairer = two_cameras(max_wait_s=100.0)
     for i in range(61):
         pairer.add_pose(ros.pose(START + i * 100 * MS))
@@ -269,7 +269,7 @@ def test_cameras_in_tf_need_no_numbers():
     config = Config.from_flat({"input.cameras": "a,b", "input.pose_source": "tf", "input.camera_frame": "x, y"})
     tree = TransformTree(1.0)
     tree.add(ros.transforms(("map", "x", 0, (1.0, 0.0, 0.0)), ("map", "y", 0, (2.0, 0.0, 0.0))), "/tf", static=True)
-    pairer = FramePairer(config.input, tree)
+    pairer = FedPairer(config.input, tree)
     for camera in (0, 1):
         pairer.add_camera_info(ros.camera_info(), camera)
         see(pairer, START + camera, camera=camera)

@@ -13,7 +13,7 @@ HALF = float(np.sqrt(0.5))
 
 
 def tree_of(*edges, max_gap_s: float = 2.0) -> TransformTree:
-    """Edges of parent, child, stamp (None: static), x, and a quaternion if it is turned."""
+    """Build a tree of edges: parent, child, stamp (None: static), x, and a quaternion if it is turned."""
     tree = TransformTree(max_gap_s)
     for parent, child, stamp_ns, x, *turn in edges:
         message = ros.transforms((parent, child, stamp_ns or 0, (x, 0.0, 0.0), *turn))

@@ -1,4 +1,4 @@
-"""A miniature walk as HOV-SG's generator writes it, its object ids, and what happens to a broken one."""
+"""A miniature walk as HOV-SG's generator writes it, its object ids, and errors of broken ones."""
 
 from __future__ import annotations
 

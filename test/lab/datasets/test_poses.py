@@ -1,4 +1,4 @@
-"""Poses of quaternions, and the axes of the cameras that datasets have."""
+"""Poses from quaternions, and the camera axes of datasets."""
 
 from __future__ import annotations
 

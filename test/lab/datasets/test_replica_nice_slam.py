@@ -1,4 +1,4 @@
-"""A miniature room in NICE-SLAM's layout, its labelled mesh, and every way in which one can be broken."""
+"""A miniature room in NICE-SLAM's layout, its labelled mesh, and errors of broken ones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def room(tmp_path):
 
 
 def write_habitat(folder, face_objects=(4, 4, 9), truncate=0):
-    """Three quads of one metre at x = 0, 1 and 2, of a sofa, the same sofa, and something without a class."""
+    """Write three quads of one metre at x = 0, 1 and 2: two of one sofa, and one of something without a class."""
     folder.mkdir(parents=True)
     classes = [{"id": 31, "name": "wall"}, {"id": 76, "name": "sofa"}]
     objects = [{"id": 4, "class_id": 76, "class_name": "sofa"}, {"id": 9, "class_id": -1, "class_name": "undefined"}]

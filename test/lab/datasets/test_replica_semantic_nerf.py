@@ -1,4 +1,4 @@
-"""A miniature room in Semantic-NeRF's layout, its label images, and what happens to a broken one."""
+"""A miniature room in Semantic-NeRF's layout, its label images, and errors of broken ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A miniature exported scan with lost poses, label images and a labelled mesh, and what happens to a broken one."""
+"""A miniature exported scan with lost poses, label images and a labelled mesh, and errors of broken ones."""
 
 from __future__ import annotations
 

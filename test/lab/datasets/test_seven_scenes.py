@@ -1,4 +1,4 @@
-"""A miniature folder in the dataset's true layout; every way in which one can be broken; the real recording."""
+"""A miniature folder in the dataset's layout, errors of broken ones, and the real recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A miniature trajectory of TartanGround: packed depth, poses of a NED world, labels; and what happens to a broken one."""
+"""A miniature trajectory of TartanGround: packed depth, poses of a NED world, labels; and errors of broken ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A miniature sequence of the TUM RGB-D benchmark: association by stamp, distortion, and what happens to a broken one."""
+"""A miniature sequence of the TUM RGB-D benchmark: association by stamp, distortion, and errors of broken ones."""
 
 from __future__ import annotations
 

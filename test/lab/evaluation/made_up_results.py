@@ -1,4 +1,4 @@
-"""Made-up results in which every claim holds, to be changed by a test where it should not."""
+"""Made-up results in which every claim holds; tests change them to make a claim fail."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BYTES_PER_M3 = 2.0e7
 
 
 def made_up_records(scene=SCENE, seeds=SEEDS, **levels):
-    """Scores of every layer and mode; levels override LEVELS, with the name ``layer__mode``."""
+    """Make scores of every layer and mode; ``levels``, named ``layer__mode``, override LEVELS."""
     found = []
     for (layer, mode), level in LEVELS.items():
         level = levels.get(f"{layer}__{mode}", level)
@@ -41,7 +41,7 @@ def made_up_records(scene=SCENE, seeds=SEEDS, **levels):
 
 
 def lambda_points(best_at=None, ratios=(0.2, 1.0, 5.0)):
-    """Sweeps that are best at their ratio, or at best_at[ratio]."""
+    """Make sweeps that are best at their ratio, or at ``best_at[ratio]``."""
     return [
         CurvePoint(
             "lambda",
@@ -58,7 +58,7 @@ def lambda_points(best_at=None, ratios=(0.2, 1.0, 5.0)):
 
 
 def memory_points(slope=1.0, bend=0.0, window_share=0.1):
-    """A dense map whose bytes rise by slope times what is predicted, and a window that ends at a share of it."""
+    """Make a dense map whose bytes rise by ``slope`` times the prediction, and a window that ends at a share of them."""
     points = []
     for volume in (100.0, 400.0, 700.0, 1000.0):
         dense = BYTES_PER_M3 * (slope * volume + bend * volume**2)
@@ -70,7 +70,7 @@ def memory_points(slope=1.0, bend=0.0, window_share=0.1):
 
 
 def window_points():
-    """Two layers at four radii, and the whole dense layer as radius 0."""
+    """Make two layers at four radii, and the whole dense layer as radius 0."""
     return [
         CurvePoint("window_radius", layer, seed, radius, metric, level - (0.1 / radius if radius else 0) + 0.01 * seed)
         for layer, level in (("fused_instances", 0.5), ("instances", 0.4))
@@ -81,7 +81,7 @@ def window_points():
 
 
 def association_points(**better):
-    """Three ways to associate; better adds to a metric of ``visible IoU 0.2``."""
+    """Make three ways to associate; ``better`` adds to a metric of ``visible IoU 0.2``."""
     levels = {"IoU 0.2": 0.40, "visible IoU 0.2": 0.45, "IoU 0.2 + merging": 0.42}
     points = []
     for way, level in levels.items():
@@ -93,5 +93,5 @@ def association_points(**better):
 
 
 def all_points():
-    """Points of every experiment."""
+    """Make points of every experiment."""
     return [*lambda_points(), *memory_points(), *window_points(), *association_points()]

@@ -1,4 +1,4 @@
-"""The paper's numbers stand beside ours only where they may, and each row says whose it is."""
+"""The paper's numbers are shown beside ours only where both are comparable, and each row says whose it is."""
 
 from __future__ import annotations
 

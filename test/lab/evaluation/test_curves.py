@@ -1,4 +1,4 @@
-"""What is read off a curve is where it was put."""
+"""Figures read off curves are those put into them."""
 
 from __future__ import annotations
 

@@ -24,7 +24,7 @@ CONFIG = Config().with_values({"image.width": 320, "image.height": 240})
 
 
 class LabelledBuilding:
-    """A building as a dataset with label images, and with points if asked."""
+    """A building as a dataset with label images and, if wanted, with points."""
 
     name, scene = "building", "simulated ward"
 

@@ -1,4 +1,4 @@
-"""Records are put under the right heading, and only like is compared with like."""
+"""Records are grouped correctly, and only equal scenes and seeds are compared."""
 
 from __future__ import annotations
 

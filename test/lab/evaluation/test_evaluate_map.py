@@ -21,7 +21,7 @@ from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from fus3dmaps_lab.evaluation.evaluate_map import INSTANCE_LAYERS, EvaluationProtocol, evaluate_map
 from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth, voxel_truth
-from fus3dmaps_lab.evaluation.matching import match_predictions
+from fus3dmaps_lab.evaluation.matching import mode_of_neighbours, nearest_voxels
 from fus3dmaps_lab.evaluation.prediction import layer_cosines
 from fus3dmaps_lab.evaluation.records import LAYERS
 from fus3dmaps_lab.evaluation.retrieval import instance_scores
@@ -34,13 +34,13 @@ BACKGROUND = frozenset({WALL})
 
 
 def block(x: int, side: int = 3) -> np.ndarray:
-    """Centres of the voxels of a cube that begins at voxel x."""
+    """Return the centres of the voxels of a cube that begins at voxel x."""
     cells = np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     return (cells + [x, 0, 0] + 0.5) * SIZE_M
 
 
 def see(semantic_map: SemanticMap, points_m: np.ndarray, dense: int, instance: int, times: int = 1) -> None:
-    """Let the dense layer see one class and the instance layer one, each with full certainty."""
+    """Show one class to the dense layer and one to the instance layer, each with full certainty."""
     count = len(points_m)
     colors = np.zeros((count, 3), np.uint8)
     for _ in range(times):
@@ -49,7 +49,7 @@ def see(semantic_map: SemanticMap, points_m: np.ndarray, dense: int, instance: i
 
 
 def truth_of(*things: tuple[np.ndarray, int]) -> VoxelTruth:
-    """Truth of things with a class; each is an instance."""
+    """Make the truth of things with a class; each is an instance."""
     points_m = np.concatenate([points for points, _ in things])
     classes = np.concatenate([np.full(len(points), label) for points, label in things])
     instances = np.concatenate([np.full(len(points), number + 1) for number, (points, _) in enumerate(things)])
@@ -186,7 +186,7 @@ def test_a_text_encoder_is_as_good_as_its_vectors():
 
 
 def judged_plainly(reference, layer, truth, vectors, kept, logit_scale):
-    """Scores of the classes kept, from a plain map, scipy's softmax and scikit-learn; 0 stands for the other classes."""
+    """Score the kept classes with a plain map, scipy's softmax and scikit-learn; 0 stands for the other classes."""
     embeddings = layer_embeddings(reference, layer)
     keys = sorted(embeddings)
     cosines = [[cosine(embeddings[key], list(vectors[label - 1])) for label in kept] for key in keys]
@@ -194,9 +194,9 @@ def judged_plainly(reference, layer, truth, vectors, kept, logit_scale):
     spoken = np.array(kept)[likely.argmax(axis=1)]
     judged = np.isin(truth.classes, kept)
     true = truth.classes[judged]
-    predicted = match_predictions(truth.keys[judged], np.array(keys), spoken, 5)
+    predicted = mode_of_neighbours(nearest_voxels(truth.keys[judged], np.array(keys), 5), spoken)
     options = {"labels": sorted(set(true.tolist())), "zero_division": 0.0}
-    nearest = match_predictions(truth.keys[judged], np.array(keys), np.arange(len(keys)), 1)
+    nearest = nearest_voxels(truth.keys[judged], np.array(keys), 1).places[:, 0]
     confidence, right = likely.max(axis=1)[nearest], spoken[nearest] == true
     bins = np.clip(np.ceil(confidence * 15) - 1, 0, 14)
     return {

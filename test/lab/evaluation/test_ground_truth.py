@@ -29,7 +29,7 @@ a_point = st.tuples(coordinates, coordinates, coordinates, st.integers(0, 3), st
 
 
 def counted(points, rounding, last_choice=frozenset()):
-    """(class, instance) by voxel, by plain counting."""
+    """Return (class, instance) by voxel, by plain counting."""
     votes = defaultdict(list)
     for x, y, z, label, instance in points:
         scaled = [each / SIZE_M for each in (x, y, z)]
@@ -91,7 +91,7 @@ def test_classes_that_are_taken_out_lose_their_instances_too():
 
 
 def frames_of(points, images):
-    """One-row label images whose pixels are lifted to the given points, dealt to so many of them in turn."""
+    """Make one-row label images whose pixels lie at the given points, which are dealt to a number of images in turn."""
     frames = []
     for start in range(images):
         mine = points[start::images]

@@ -1,4 +1,4 @@
-"""Overlaps against plain sets, average precision against scikit-learn and a plain matching, pieces by hand."""
+"""Overlaps against plain sets, average precision against scikit-learn and a plain matching, segmentation by hand."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_overlaps_agree_with_plain_sets(scene):
 
 
 def matched_plainly(scene, scores, min_iou):
-    """(score, right) of each predicted instance that counts, best first."""
+    """Return (score, right) of each predicted instance that counts, best first."""
     predicted, true = sets_of(scene)
     labelled = set().union(*true.values())
     free, found = dict(true), []
@@ -94,7 +94,7 @@ def test_pieces_are_counted_as_defined(scene):
 
 
 def scene_of(predicted: str, true: str):
-    """One letter a voxel: the predicted instance a, b, ..., or none; the true one 1, 2, ..., or none."""
+    """Make a scene from one letter per voxel: the predicted instance a, b, ..., or none; the true one 1, 2, ..., or none."""
     return [
         (set() if p == "." else {ord(p) - ord("a")}, 0 if t == "." else int(t)) for p, t in zip(predicted, true, strict=True)
     ]

@@ -1,4 +1,4 @@
-"""Nearest voxels against brute force, and the mode as torch takes it; the order of voxels plays no role."""
+"""Nearest voxels against brute force, and the mode against torch, for any order of voxels."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from fus3dmaps_core.errors import MapError
 from fus3dmaps_lab.evaluation import matching
 from fus3dmaps_lab.evaluation.ground_truth import VoxelTruth
-from fus3dmaps_lab.evaluation.matching import Neighbours, match_predictions, mode_of_neighbours, nearest_voxels, seen_truth
+from fus3dmaps_lab.evaluation.matching import Neighbours, mode_of_neighbours, nearest_voxels, same_voxels
 
 small = st.integers(-3, 3)
 voxel_sets = st.sets(st.tuples(small, small, small), max_size=40).map(sorted)
@@ -24,7 +24,7 @@ def keys_of(voxels) -> np.ndarray:
 
 
 def nearest_by_brute_force(position, voxels, k):
-    """The k nearest voxels, of equally near ones the lexicographically lowest."""
+    """Return the k nearest voxels, of equally near ones the lexicographically lowest."""
     return sorted(voxels, key=lambda key: (sum((a - b) ** 2 for a, b in zip(position, key, strict=True)), key))[:k]
 
 
@@ -54,7 +54,7 @@ def test_many_equally_near_voxels_are_all_considered():
 @given(positions, voxel_sets, st.integers(1, 7), st.integers(0, 2**32 - 1))
 def test_the_mode_is_the_one_of_torch(wanted, voxels, k, seed):
     classes = np.random.default_rng(seed).integers(0, 3, len(voxels)).astype(np.int32)
-    matched = match_predictions(np.array(wanted).reshape(-1, 3), keys_of(voxels), classes, k)
+    matched = mode_of_neighbours(nearest_voxels(np.array(wanted).reshape(-1, 3), keys_of(voxels), k), classes)
     assert matched.dtype == np.int32
     by_voxel = dict(zip(voxels, classes.tolist(), strict=True))
     expected = [[by_voxel[each] for each in nearest_by_brute_force(position, voxels, k)] for position in wanted]
@@ -71,37 +71,22 @@ def test_of_equally_frequent_classes_the_lowest_wins(pairs):
 
 
 def test_however_far_the_nearest_voxels_speak():
-    assert match_predictions(np.array([[1000, 0, 0]]), keys_of([(0, 0, 0)]), np.array([4])).tolist() == [4]
+    found = nearest_voxels(np.array([[1000, 0, 0]]), keys_of([(0, 0, 0)]), 5)
+    assert mode_of_neighbours(found, np.array([4])).tolist() == [4]
 
 
 @given(voxel_sets, voxel_sets, st.randoms(use_true_random=False))
-def test_on_the_union_grid_a_missing_voxel_predicts_nothing(wanted, voxels, random):
+def test_on_the_union_grid_a_voxel_is_found_or_known_to_be_missing(wanted, voxels, random):
     random.shuffle(voxels)
-    classes = np.arange(1, len(voxels) + 1)
-    matched = match_predictions(keys_of(wanted), keys_of(voxels), classes, k=0)
-    held = dict(zip(voxels, classes.tolist(), strict=True))
-    assert matched.tolist() == [held.get(each, 0) for each in wanted]
+    held = {voxel: place for place, voxel in enumerate(voxels)}
+    assert same_voxels(keys_of(wanted), keys_of(voxels)).tolist() == [held.get(each, -1) for each in wanted]
 
 
 def test_a_truth_between_the_voxels_has_no_union_grid_and_odd_positions_are_refused():
     between = VoxelTruth(keys_of([(0, 0, 0)]), np.ones(1, np.int32), np.ones(1, np.int32), rounding="round").positions
     with pytest.raises(MapError, match="k: 0 needs a truth on the map's own grid"):
-        match_predictions(between, keys_of([(0, 0, 0)]), np.array([1]), k=0)
+        same_voxels(between, keys_of([(0, 0, 0)]))
     with pytest.raises(MapError, match="positions: must be whole or half"):
         nearest_voxels(np.array([[0.25, 0, 0]]), keys_of([(0, 0, 0)]), 1)
     with pytest.raises(MapError, match="k: must be at least 1"):
         nearest_voxels(np.zeros((1, 3)), keys_of([(0, 0, 0)]), 0)
-
-
-@given(voxel_sets, voxel_sets, st.sampled_from([0.0, 1.0, 1.5, 2.0]))
-def test_seen_truth_is_what_is_near_a_voxel_that_was_seen(wanted, seen, reach):
-    count = np.arange(len(wanted), dtype=np.int32)
-    truth = seen_truth(VoxelTruth(keys_of(wanted), count, count + 1, 0.1), keys_of(seen), reach)
-    near = [
-        row
-        for row, key in enumerate(wanted)
-        if any(np.linalg.norm(np.subtract(key, each)) <= reach + 1e-12 for each in seen)
-    ]
-    np.testing.assert_array_equal(truth.keys, keys_of([wanted[row] for row in near]))
-    assert (truth.classes.tolist(), truth.instances.tolist()) == (near, [row + 1 for row in near])
-    assert truth.voxel_size_m == 0.1

@@ -1,4 +1,4 @@
-"""Plots hold the data that they were given, say what it is, and come out the same every time."""
+"""Plots show the data that they were given, name it, and are the same every time."""
 
 from __future__ import annotations
 

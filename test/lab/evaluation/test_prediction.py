@@ -29,7 +29,7 @@ cosines = arrays(
 
 
 def predicted_plainly(values, scale, min_probability, min_peak):
-    """Of one chunk, as the protocol is written."""
+    """Predict the classes of one chunk by the words of the protocol."""
     likely = softmax(scale * values.astype(np.float64), axis=1)
     found = []
     for row in likely:
@@ -127,7 +127,7 @@ def test_odd_questions_are_refused():
 
 def test_a_map_that_changes_meanwhile_is_refused():
     class Changing(SemanticMap):
-        """Gets a voxel with every question."""
+        """A map that gets a new voxel with every query."""
 
         def search(self, query):
             point = np.full((1, 3), self.voxel_count + 0.5)

@@ -1,17 +1,17 @@
-"""Records survive their file; what is not a list of records is refused by file and entry."""
+"""Records survive their file, which is plain JSON; what cannot be written is refused by file."""
 
 from __future__ import annotations
 
 import json
 import math
-import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fus3dmaps_core.errors import StorageError
-from fus3dmaps_lab.evaluation.records import LAYERS, MODES, Record, read_records, write_records
+from fus3dmaps_lab.evaluation.records import LAYERS, MODES, Record, write_records
 
 texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=20)
 a_record = st.builds(
@@ -24,6 +24,11 @@ a_record = st.builds(
     value=st.floats(allow_nan=True, allow_infinity=False),
 )
 GOOD = {"scene": "room0", "seed": 3, "layer": "dense", "mode": "full", "metric": "mIoU", "value": 0.5}
+
+
+def read_records(path: Path) -> list[Record]:
+    entries = json.loads(path.read_text(encoding="utf-8"))
+    return [Record(**(entry | {"value": math.nan if entry["value"] is None else entry["value"]})) for entry in entries]
 
 
 def as_compared(records):
@@ -57,41 +62,7 @@ def test_an_infinite_value_is_refused_and_the_file_stays(tmp_path):
     assert read_records(path) == [Record(**GOOD)]
 
 
-@pytest.mark.parametrize(
-    ("content", "named"),
-    [
-        ("[", "is not JSON"),
-        ("[" * 100_000, "is not JSON"),
-        ("{}", "must hold a list"),
-        ([1], "record 0: must have the keys scene, seed"),
-        ([GOOD, {**GOOD, "spread": 1}], "record 1: must have the keys"),
-        ([{key: value for key, value in GOOD.items() if key != "mode"}], "record 0: must have the keys"),
-        ([GOOD | {"layer": "sparse"}], "record 0: layer must be one of dense"),
-        ([GOOD | {"mode": "half"}], "record 0: mode must be one of full"),
-        ([GOOD | {"mode": ["full"]}], "record 0: mode must be a text"),
-        ([GOOD | {"scene": None}], "record 0: scene must be a text"),
-        ([GOOD | {"metric": 5}], "record 0: metric must be a text"),
-        ([GOOD | {"seed": 1.5}], "record 0: seed must be a whole number"),
-        ([GOOD | {"seed": True}], "record 0: seed must be a whole number"),
-        ([GOOD | {"value": "0.5"}], "record 0: value must be a number or null"),
-        ([GOOD | {"value": False}], "record 0: value must be a number or null"),
-        ([GOOD | {"value": math.nan}], "record 0: value must be a number or null"),
-        ([GOOD | {"value": math.inf}], "record 0: value must be a number or null"),
-    ],
-)
-def test_what_is_not_records_is_refused_by_file_and_entry(tmp_path, content, named):
-    path = tmp_path / "results.json"
-    path.write_text(content if isinstance(content, str) else json.dumps(content))
-    with pytest.raises(StorageError, match=f"{re.escape(str(path))}: {re.escape(named)}"):
-        read_records(path)
-
-
-def test_missing_and_unwritable_files_are_named(tmp_path):
-    with pytest.raises(StorageError, match=r"nothing\.json: cannot be read"):
-        read_records(tmp_path / "nothing.json")
+def test_an_unwritable_file_is_named(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(StorageError, match=r"results\.json: cannot be written"):
         write_records(tmp_path / "file" / "results.json", [])
-    (tmp_path / "binary.json").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(StorageError, match=r"binary\.json: is not JSON"):
-        read_records(tmp_path / "binary.json")

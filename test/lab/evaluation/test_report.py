@@ -1,4 +1,4 @@
-"""A report shows what there is, says what there is not, and is written whole or not at all."""
+"""A report shows all results, names missing ones, and is written completely or not at all."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ NOTES = {"command": "fus3dmaps evaluate simulation --seeds 5", "machine": "2 cor
 
 
 def section(page, heading, level=2):
-    """Text under a heading, up to the next one of its level or above."""
+    """Return the text under a heading, up to the next one of its level or above."""
     found = re.search(rf"^{'#' * level} {re.escape(heading)}\n(.*?)(?=^#{{1,{level}}} |\Z)", page, re.M | re.S)
     assert found, heading
     return found[1]
@@ -42,7 +42,7 @@ def verdict_lines(page):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Directory and page of a report on everything."""
+    """Write a report on everything; return its directory and page."""
     directory = tmp_path_factory.mktemp("report") / "of" / "today"
     path = write_report(directory, made_up_records(), all_points(), NOTES)
     assert path == directory / "report.md"

@@ -1,4 +1,4 @@
-"""Rankings against plain ones, and what is found, by hand."""
+"""Rankings against plain ones, and retrieval scores by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Models that several maps share are run once for each image, and give what they would give alone."""
+"""Shared models run once for each image and give the same results as unshared ones."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from fus3dmaps_lab.evaluation.shared_models import shared_segmenter, shared_trio
 
 
 class Counting:
-    """All models in one; what they give depends on the image and the mask."""
+    """All models in one; their results depend on the image and the mask."""
 
     def __init__(self) -> None:
         self.patches = self.crops = self.segmented = 0

@@ -1,4 +1,4 @@
-"""Studies of simulated buildings: what is compared is what is said, and seeds do not meet."""
+"""Studies of simulated buildings: they compare what they name, and seeds are independent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables hold every number, and CSV gives back exactly what was put in."""
+"""Tables hold every number, and CSV gives back exactly the same numbers."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def read_csv(text):
 
 
 def records_of(values, scene=SCENE):
-    """values: {(layer, mode): [value of seed 0, 1, ...]} of mIoU."""
+    """Make mIoU records from ``values``: {(layer, mode): [value of seed 0, 1, ...]}."""
     return [Record(scene, s, *where, "mIoU", v) for where, vs in values.items() for s, v in enumerate(vs)]
 
 

@@ -1,4 +1,4 @@
-"""Verdicts follow the data, and turn when the data do."""
+"""Verdicts follow the data, and change with it."""
 
 from __future__ import annotations
 

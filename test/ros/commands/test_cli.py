@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from fus3dmaps_core.encoders import registry
-from fus3dmaps_core.messages.fields import decode_color
+from fus3dmaps_core.messages.images import decode_color
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_core.saved_maps.storage import read_manifest

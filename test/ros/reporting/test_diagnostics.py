@@ -15,11 +15,12 @@ from robot import CallbackThreads, wait_until
 from sensor_msgs.msg import Image
 
 from fus3dmaps_core.health.diagnosis import Diagnosis, MapSizes
-from fus3dmaps_core.health.input_problems import Offer, Stream
+from fus3dmaps_core.health.input_problems import Offer
 from fus3dmaps_core.health.mapping_problems import MemoryState
+from fus3dmaps_core.sources.streams import Stream
 from fus3dmaps_ros.reporting.diagnostics import Diagnostics, publishers_of
 
-DEPTH = Stream("depth/image", "depth", "RELIABLE", "VOLATILE", "input.depth_topic", "input.depth_qos")
+DEPTH = Stream("depth/image", "depth", "sensor_msgs/msg/Image", "input.depth_topic", "reliable", lambda message: None)
 BEST_EFFORT = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
     depth=5,

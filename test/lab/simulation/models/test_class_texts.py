@@ -1,4 +1,4 @@
-"""Class texts: unit vectors whose cosines lie where they are said to."""
+"""Class texts: unit vectors with the stated cosines."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ DIMENSION = 128
 
 
 def cosines(names: list[str], similarity: TextSimilarity | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """Cosines of all pairs of one group, and of all other pairs, over 20 seeds."""
+    """Return the cosines of all pairs of one group, and of all other pairs, over 20 seeds."""
     groups = [group_of(name) for name in names]
     same = np.array([[a is not None and a == b for a in groups] for b in groups])
     related, unrelated = [], []

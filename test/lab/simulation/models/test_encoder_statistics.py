@@ -17,24 +17,6 @@ def test_the_ratio_is_that_of_the_variances():
     assert EncoderStatistics(patch_variance=0.0, crop_variance=0.0).variance_ratio == 1.0
 
 
-@pytest.mark.parametrize(("patch", "crop"), [(0.01, 0.002), (8.0, 2.0), (3.0, 6.0), (200.0, 20.0)])
-def test_the_normalised_ratio_is_where_unit_embeddings_sum_best(patch: float, crop: float):
-    rng = np.random.default_rng(0)
-    dimension, draws = 2048, 500
-    signal = np.zeros(dimension)
-    signal[0] = 1.0
-    unit = []
-    for variance in (patch, crop):
-        drawn = signal + rng.normal(scale=(variance / dimension) ** 0.5, size=(draws, dimension))
-        unit.append(drawn / np.linalg.norm(drawn, axis=1, keepdims=True))
-    lengths = [observed[:, 0].mean() for observed in unit]
-    noises = [(observed[:, 1:] ** 2).sum(axis=1).mean() for observed in unit]
-    ratios = np.geomspace(1e-3, 1e3, 4001)
-    gain = (lengths[0] + ratios * lengths[1]) ** 2 / (noises[0] + ratios**2 * noises[1])
-    statistics = EncoderStatistics(patch_variance=patch, crop_variance=crop)
-    assert statistics.normalised_variance_ratio == pytest.approx(ratios[gain.argmax()], rel=0.05)
-
-
 @pytest.mark.parametrize(
     ("field", "value"),
     [

@@ -1,4 +1,4 @@
-"""The oracle hands out the labels of the frame at hand, at the size that is asked for."""
+"""The oracle returns the labels of the current frame at the requested size."""
 
 from __future__ import annotations
 

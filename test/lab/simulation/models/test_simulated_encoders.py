@@ -1,4 +1,4 @@
-"""The simulated trio: what is mixed, how much noise there is, and that a frame always gives the same."""
+"""The simulated trio: mixing, amount of noise, and equal results for equal frames."""
 
 from __future__ import annotations
 
@@ -249,7 +249,7 @@ def test_an_image_that_the_oracle_does_not_look_at_is_refused():
 
 @pytest.mark.parametrize("layer", ["dense", "fused_dense", "instances", "fused_instances"])
 def test_without_errors_the_whole_pipeline_names_every_voxel_rightly(layer: str):
-    """A wall 2 m away with a table and a cup painted on it, borders on those of patches and voxels' middles left out."""
+    """A wall 2 m away shows a table and a cup. Their borders lie on those of patches; voxels on a border are left out."""
     parts = painted(480, 640, [(2, 160, 160, 320, 320), (3, 160, 400, 240, 480)])
     truth, oracle = truth_of([1, 2, 3]), Oracle()
     errorless = SegmenterStatistics(

@@ -1,4 +1,4 @@
-"""The simulated segmenter: what masks are made of, how often each error comes, and that a frame always gives the same."""
+"""The simulated segmenter: its masks, the rate of each error, and equal results for equal frames."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def holds(masks: Masks, mask: np.ndarray) -> bool:
 
 
 def often(parts: np.ndarray, truth: Truth, statistics: SegmenterStatistics, mask: np.ndarray, depth_m=2.0) -> int:
-    """In how many of many frames this very mask is given out."""
+    """Count the frames, of many, in which exactly this mask is returned."""
     oracle = Oracle()
     segmenter = SimulatedSegmenter(oracle, truth, statistics)
     count = 0
@@ -53,7 +53,7 @@ def often(parts: np.ndarray, truth: Truth, statistics: SegmenterStatistics, mask
 
 
 def assert_rate(count: int, probability: float) -> None:
-    """Within 4.5 standard deviations of a binomial count; nothing is exact but 0 and 1."""
+    """Assert a rate within 4.5 standard deviations of a binomial count; rates of 0 and 1 must be exact."""
     assert abs(count - DRAWS * probability) <= 4.5 * (DRAWS * probability * (1 - probability)) ** 0.5 + 1e-9
 
 

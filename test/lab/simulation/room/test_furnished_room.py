@@ -19,7 +19,7 @@ def views(room):
 
 
 def photo_of(room, name):
-    """The panel that carries the photograph."""
+    """Return the panel with the photograph."""
     original = photograph(name)
     (panel,) = (p for p in room._scene.panels if np.array_equal(p.material.texture, original))
     return original, panel

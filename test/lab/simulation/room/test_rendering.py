@@ -18,7 +18,7 @@ def quadrant_texture():
 
 
 def wall_with_print():
-    """A grey wall at y = 2 with a 0.8 m x 0.8 m print at (0.3, 1.2) on it, 1 cm in front."""
+    """Build a grey wall at y = 2 with a 0.8 m x 0.8 m print at (0.3, 1.2) on it, 1 cm in front."""
     builder = SceneBuilder()
     builder.panel((0, 2, 1), (0, -1, 0), (60, 60), GREY)
     with builder.thing("print"):

@@ -9,7 +9,7 @@ SIZES = st.tuples(st.integers(1, 9), st.integers(1, 9))
 
 
 def plain_bilinear(image, u, v, repeat):
-    """One sample, texel by texel; outside texels wrap or repeat the edge."""
+    """Compute one sample, texel by texel; outside texels wrap or repeat the edge."""
     height, width = image.shape[:2]
     x, y = u * width - 0.5, v * height - 0.5
     x0, y0 = int(np.floor(x)), int(np.floor(y))

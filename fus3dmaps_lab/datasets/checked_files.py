@@ -1,4 +1,4 @@
-"""Reading the files that datasets are made of; what cannot be used is refused under the file's name."""
+"""Reading and checking of dataset files. A file that cannot be used raises an error with its name."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from fus3dmaps_core.errors import FrameError, RecordingError
 from fus3dmaps_core.frame import Intrinsics, check_pose
 from fus3dmaps_core.messages.image_files import decode_pixels, read_header
 
-_EPOCH_NS = 1_356_998_400 * 1_000_000_000  # 1 January 2013: any time would do where files carry none, but 0 means unset.
+_EPOCH_NS = 1_356_998_400 * 1_000_000_000  # 1 January 2013; for files without times, any time but 0 (unset) would do.
 
 
-def stamp_ns(number: int, rate_hz: float) -> int:
-    """A stamp for the frame of this number in a sequence whose files carry no time, nanoseconds."""
+def frame_stamp_ns(number: int, rate_hz: float) -> int:
+    """Make a stamp for a frame number of a sequence without times, nanoseconds."""
     return _EPOCH_NS + round(number * 1e9 / rate_hz)
 
 
 def require_directory(path: Path, what: str) -> None:
-    """Raise RecordingError unless ``path`` is a directory; ``what`` says what it should hold."""
+    """Raise RecordingError unless ``path`` is a directory. ``what`` says what it should hold."""
     if not path.is_dir():
         raise RecordingError(f"'{path}' is not a directory, expected {what}")
 
 
 def require_file(path: Path, what: str = "") -> Path:
-    """The path; raise RecordingError unless it is a file, ``what`` says what it should hold."""
+    """Return the path; raise RecordingError unless it is a file. ``what`` says what it should hold."""
     if not path.is_file():
         raise RecordingError(f"file '{path}' is missing" + (f", expected {what}" if what else ""))
     return path
 
 
 def numbered_files(directory: Path, pattern: str, example: str) -> dict[int, Path]:
-    """Files of a directory by the number in their names, in its order.
+    """List the files of a directory by the number in their names, in ascending order.
 
     Args:
-        directory: Where they are.
+        directory: The directory.
         pattern: Regular expression of the whole name whose first group is the number.
-        example: How a name looks, for messages.
+        example: Example of a name, for error messages.
 
     Raises:
-        RecordingError: There is no such directory or no such file in it, or two files have one number.
+        RecordingError: There is no such directory or no such file in it, or two files have the same number.
     """
     require_directory(directory, f"files like {example}")
     found: dict[int, Path] = {}
@@ -63,7 +63,7 @@ def numbered_files(directory: Path, pattern: str, example: str) -> dict[int, Pat
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Width and height of a JPEG or PNG, pixels, by its header."""
+    """Read width and height of a JPEG or PNG from its header, pixels."""
     try:
         header = read_header(_bytes(path))
     except FrameError as error:
@@ -72,17 +72,17 @@ def image_size(path: Path) -> tuple[int, int]:
 
 
 def read_rgb(path: Path) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 colours of a JPEG or PNG."""
+    """Read the (H, W, 3) uint8 colours of a JPEG or PNG."""
     return np.asarray(_pixels(path, cv2.IMREAD_COLOR_RGB), np.uint8)
 
 
 def read_depth(path: Path, units_per_m: float, no_reading: int = 0) -> NDArray[np.float32]:
-    """(h, w) float32 metres of a PNG of 16 bits.
+    """Read depth from a 16-bit PNG as (h, w) float32 metres.
 
     Args:
         path: The file.
         units_per_m: Value of a pixel at one metre.
-        no_reading: Value that means no reading, as 0 does.
+        no_reading: Value that means no reading, besides 0.
     """
     raw = _pixels(path, cv2.IMREAD_UNCHANGED)
     _check_kind(path, raw, np.uint16, 2)
@@ -90,7 +90,7 @@ def read_depth(path: Path, units_per_m: float, no_reading: int = 0) -> NDArray[n
 
 
 def read_packed_depth(path: Path) -> NDArray[np.float32]:
-    """(h, w) float32 metres of a PNG whose four channels, blue first, are the bytes of a little-endian float."""
+    """Read (h, w) float32 metres from a PNG whose four channels, blue first, are the bytes of a little-endian float."""
     raw = _pixels(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint8 or raw.ndim != 3 or raw.shape[2] != 4:
         raise RecordingError(f"'{path}' holds {raw.shape} {raw.dtype}, expected 4 channels of 8 bits that pack a float")
@@ -98,7 +98,7 @@ def read_packed_depth(path: Path) -> NDArray[np.float32]:
 
 
 def read_ids(path: Path) -> NDArray[np.int32]:
-    """(H, W) int32 values of a PNG with one channel of 8 or 16 bits."""
+    """Read the (H, W) int32 values of a PNG with one channel of 8 or 16 bits."""
     raw = _pixels(path, cv2.IMREAD_UNCHANGED)
     if raw.ndim != 2 or raw.dtype not in (np.uint8, np.uint16):
         raise RecordingError(f"'{path}' holds {raw.shape} {raw.dtype}, expected one channel of 8 or 16 bits")
@@ -106,10 +106,10 @@ def read_ids(path: Path) -> NDArray[np.int32]:
 
 
 def read_rows(path: Path, columns: int) -> NDArray[np.float64]:
-    """(n, columns) numbers of a text file, a row a line; what follows a # is left out.
+    """Read (n, columns) numbers from a text file with one row per line; text after a # is left out.
 
     Raises:
-        RecordingError: It cannot be read, or a line holds something else; the message names file and line.
+        RecordingError: It cannot be read, or a line holds anything else; the message names file and line.
     """
     rows = []
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -127,7 +127,7 @@ def read_rows(path: Path, columns: int) -> NDArray[np.float64]:
 
 
 def read_matrix(path: Path, size: int, *, finite: bool = True) -> NDArray[np.float64]:
-    """(size, size) numbers of a text file, whether it breaks its lines or not."""
+    """Read a (size, size) matrix from a text file; line breaks do not matter."""
     words = read_text(path).split()
     try:
         values = np.array(words, dtype=np.float64)
@@ -141,7 +141,7 @@ def read_matrix(path: Path, size: int, *, finite: bool = True) -> NDArray[np.flo
 
 
 def checked_pose(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
-    """The pose; raise RecordingError unless it is a rigid transform, ``where`` names file and line."""
+    """Return the pose; raise RecordingError unless it is a rigid transform. ``where`` names file and line."""
     try:
         check_pose(T)
     except FrameError as error:
@@ -150,10 +150,10 @@ def checked_pose(T: NDArray[np.float64], where: str) -> NDArray[np.float64]:
 
 
 def camera_model(K: NDArray[np.float64], size: tuple[int, int], where: Path) -> Intrinsics:
-    """Intrinsics of the upper left 3x3 of ``K`` for images of (width, height) ``size``.
+    """Return the intrinsics in the upper left 3x3 of ``K`` for images of (width, height) ``size``.
 
     Raises:
-        RecordingError: They are not those of a camera; the message names the file ``where`` they come from.
+        RecordingError: They are not valid; the message names the file ``where`` they come from.
     """
     try:
         return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]), *size)
@@ -162,7 +162,7 @@ def camera_model(K: NDArray[np.float64], size: tuple[int, int], where: Path) -> 
 
 
 def read_json(path: Path) -> Any:
-    """Content of a JSON file."""
+    """Read a JSON file."""
     try:
         return json.loads(read_text(path))
     except json.JSONDecodeError as error:
@@ -170,7 +170,7 @@ def read_json(path: Path) -> Any:
 
 
 def read_text(path: Path) -> str:
-    """Content of a text file."""
+    """Read a text file."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:

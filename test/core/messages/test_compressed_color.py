@@ -1,4 +1,4 @@
-"""Compressed colour images against OpenCV's encoder; sizes; what is cut, damaged or no colour image is refused."""
+"""Compressed colour images against OpenCV's encoder; sizes; truncated, damaged and other images are refused."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fus3dmaps_core.errors import FrameError
-from fus3dmaps_core.messages import fields as messages
 from fus3dmaps_core.messages import images
 
 JPEG_FORMATS = [
@@ -36,7 +35,7 @@ def encoded(kind: str, rgb: np.ndarray, *options: int) -> bytes:
 
 
 def smooth_rgb(height: int = 24, width: int = 36) -> np.ndarray:
-    """Red grows to the right, green downwards, blue against red: swapped channels or axes do not go unnoticed."""
+    """Make an image whose red grows to the right, green downwards, blue to the left: swapped channels or axes show."""
     right, down = np.linspace(20, 230, width), np.linspace(40, 200, height)
     return np.stack(np.broadcast_arrays(right, down[:, None], right[::-1]), axis=2).round().astype(np.uint8)
 
@@ -45,8 +44,8 @@ def smooth_rgb(height: int = 24, width: int = 36) -> np.ndarray:
 def test_png_comes_back_exactly(text, rng):
     rgb = rng.integers(0, 256, (5, 7, 3), dtype=np.uint8)
     message = compressed(text, encoded("png", rgb))
-    messages.check_color(message, "/rgb")
-    decoded = messages.decode_color(message, "/rgb")
+    images.check_color(message, "/rgb")
+    decoded = images.decode_color(message, "/rgb")
     assert decoded.flags.c_contiguous
     assert decoded.flags.writeable
     assert decoded.dtype == np.uint8
@@ -57,8 +56,8 @@ def test_png_comes_back_exactly(text, rng):
 def test_jpeg_comes_back_nearly(text):
     rgb = smooth_rgb()
     message = compressed(text, encoded("jpg", rgb, cv2.IMWRITE_JPEG_QUALITY, 98))
-    messages.check_color(message, "/rgb")
-    decoded = messages.decode_color(message, "/rgb")
+    images.check_color(message, "/rgb")
+    decoded = images.decode_color(message, "/rgb")
     assert decoded.flags.c_contiguous
     assert np.abs(decoded.astype(int) - rgb).max() <= 12
 
@@ -66,7 +65,7 @@ def test_jpeg_comes_back_nearly(text):
 @pytest.mark.parametrize(("kind", "text"), [("png", "mono8; png compressed "), ("jpg", "mono8; jpeg compressed ")])
 def test_grey_becomes_three_equal_channels(kind, text):
     grey = smooth_rgb()[:, :, 1]
-    decoded = messages.decode_color(compressed(text, encoded(kind, grey)), "/rgb")
+    decoded = images.decode_color(compressed(text, encoded(kind, grey)), "/rgb")
     np.testing.assert_allclose(decoded, np.stack([grey] * 3, axis=2), atol=2)
     np.testing.assert_array_equal(decoded[:, :, 0], decoded[:, :, 2])
 
@@ -74,7 +73,7 @@ def test_grey_becomes_three_equal_channels(kind, text):
 def test_alpha_is_dropped(rng):
     bgra = rng.integers(0, 256, (4, 5, 4), dtype=np.uint8)
     data = cv2.imencode(".png", bgra)[1].tobytes()
-    np.testing.assert_array_equal(messages.decode_color(compressed("png", data), "/rgb"), bgra[:, :, 2::-1])
+    np.testing.assert_array_equal(images.decode_color(compressed("png", data), "/rgb"), bgra[:, :, 2::-1])
 
 
 def test_orientation_in_a_jpeg_is_ignored():
@@ -84,9 +83,9 @@ def test_orientation_in_a_jpeg_is_ignored():
     turned = data[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + data[2:]
     assert cv2.imdecode(np.frombuffer(turned, np.uint8), cv2.IMREAD_COLOR).shape == (36, 24, 3)
     message = compressed("jpeg", turned)
-    assert messages.image_size(message, "/rgb") == (36, 24)
+    assert images.image_size(message, "/rgb") == (36, 24)
     np.testing.assert_array_equal(
-        messages.decode_color(message, "/rgb"), messages.decode_color(compressed("jpeg", data), "/rgb")
+        images.decode_color(message, "/rgb"), images.decode_color(compressed("jpeg", data), "/rgb")
     )
 
 
@@ -100,9 +99,9 @@ def test_size_of_a_compressed_image(kind, progressive, rng):
 
 
 def test_size_of_a_raw_image():
-    assert messages.image_size(ros.image(), "/rgb") == (6, 4)
+    assert images.image_size(ros.image(), "/rgb") == (6, 4)
     with pytest.raises(FrameError, match=r"^/rgb: ") as caught:
-        messages.image_size(ros.image(width=0), "/rgb")
+        images.image_size(ros.image(width=0), "/rgb")
     assert caught.value.reason == "bad_image"
 
 
@@ -110,14 +109,14 @@ def test_size_of_a_raw_image():
 def test_data_may_be_any_buffer(container):
     rgb = smooth_rgb()
     message = SimpleNamespace(format="png", data=container(encoded("png", rgb)))
-    np.testing.assert_array_equal(messages.decode_color(message, "/rgb"), rgb)
+    np.testing.assert_array_equal(images.decode_color(message, "/rgb"), rgb)
 
 
 @pytest.mark.parametrize("kind", ["png", "jpg"])
 def test_zeros_after_the_end_are_padding(kind):
     data = encoded(kind, smooth_rgb())
-    whole = messages.decode_color(compressed(kind, data), "/rgb")
-    np.testing.assert_array_equal(messages.decode_color(compressed(kind, data + bytes(500)), "/rgb"), whole)
+    whole = images.decode_color(compressed(kind, data), "/rgb")
+    np.testing.assert_array_equal(images.decode_color(compressed(kind, data + bytes(500)), "/rgb"), whole)
 
 
 @pytest.mark.parametrize(
@@ -137,7 +136,7 @@ def test_zeros_after_the_end_are_padding(kind):
     ],
 )
 def test_unusable_images_are_refused_by_check_and_by_decode(text, data, reason):
-    for refuse in (messages.check_color, messages.decode_color):
+    for refuse in (images.check_color, images.decode_color):
         assert_refused(refuse, compressed(text, data), reason)
 
 
@@ -146,7 +145,7 @@ def test_unusable_images_are_refused_by_check_and_by_decode(text, data, reason):
 def test_every_truncation_is_refused(kind, data):
     whole = encoded(kind, smooth_rgb())
     message = compressed(kind, whole[: data.draw(st.integers(0, len(whole) - 1))])
-    for refuse in (messages.check_color, messages.decode_color):
+    for refuse in (images.check_color, images.decode_color):
         assert_refused(refuse, message, "bad_compression")
 
 
@@ -156,7 +155,7 @@ def test_a_png_with_a_flipped_bit_is_refused(data):
     damaged = bytearray(encoded("png", smooth_rgb()))
     bit = data.draw(st.integers(0, 8 * len(damaged) - 1))
     damaged[bit // 8] ^= 1 << bit % 8
-    assert_refused(messages.decode_color, compressed("png", bytes(damaged)), "bad_compression")
+    assert_refused(images.decode_color, compressed("png", bytes(damaged)), "bad_compression")
 
 
 @settings(max_examples=80)
@@ -168,11 +167,11 @@ def test_a_jpeg_with_flipped_bits_gives_an_image_or_a_refusal(data):
         damaged[bit // 8] ^= 1 << bit % 8
     message = compressed("jpeg", bytes(damaged))
     try:
-        outcome = messages.decode_color(message, "/rgb").shape[1::-1]
+        outcome = images.decode_color(message, "/rgb").shape[1::-1]
     except FrameError as error:
         outcome = error.reason
     refusals = ("bad_compression", "bad_image", "unknown_encoding")
-    assert outcome in refusals or outcome == messages.image_size(message, "/rgb")
+    assert outcome in refusals or outcome == images.image_size(message, "/rgb")
 
 
 def assert_refused(call, message, reason: str) -> None:

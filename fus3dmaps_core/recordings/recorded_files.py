@@ -1,4 +1,4 @@
-"""What every kind of recorded file offers to the reader."""
+"""The messages and topics of recorded files, and the interface that every kind of recorded file has."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ class RawMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """What a recording holds of a topic: its name, message type and number of messages."""
+    """A topic of a recording: its name, message type and number of messages."""
 
     topic: str
     msgtype: str
     count: int
 
 
-class Storage(Protocol):
-    """One opened file, or a directory of files with an index."""
+class RecordedFiles(Protocol):
+    """One opened recorded file, or a directory of files with an index."""
 
     @property
     def topics(self) -> dict[str, TopicSummary]:
-        """What it holds, by topic."""
+        """Summaries of the topics, by name."""
         ...
 
     @property
@@ -51,7 +51,7 @@ class Storage(Protocol):
         ...
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
-        """The messages of the given topics, or of all."""
+        """Yield the messages of the given topics, or of all."""
         ...
 
     def close(self) -> None:

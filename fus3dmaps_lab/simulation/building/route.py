@@ -1,4 +1,4 @@
-"""The way of a robot through a building: along the corridors, twice around in every room, up the stairs."""
+"""The route of a robot through a building: along the corridors, twice around in every room, up the stairs."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _LANE_M = -0.5 * HALF_CORRIDOR_M
 
 
 def route(plan: FloorPlan) -> NDArray[np.float64]:
-    """Poses of the way, at most STEP_M and about STEP_RAD apart.
+    """Compute the poses of the route, at most STEP_M and about STEP_RAD apart.
 
     Args:
-        plan: Of the building.
+        plan: Plan of the building.
 
     Returns:
         (n, 4, 4) T_world_camera of the optical frame (REP-103).
@@ -53,7 +53,7 @@ def _pose(x: float, y: float, z: float, yaw_rad: float, pitch_rad: float) -> NDA
 
 
 def _stops(plan: FloorPlan) -> list[tuple[float, float, float, float, float]]:
-    """Places (x, y, z) with heading and pitch between which the robot drives straight and turns evenly."""
+    """List the stops (x, y, z, heading, pitch); between them the robot drives straight and turns evenly."""
     stops: list[tuple[float, float, float, float, float]] = []
     for storey in range(plan.storeys):
         z = storey * STOREY_M + EYE_M
@@ -69,7 +69,7 @@ def _stops(plan: FloorPlan) -> list[tuple[float, float, float, float, float]]:
 
 
 def _in_room(room: Room, z: float) -> list[tuple[float, float, float, float, float]]:
-    """In through the door, once around looking out, once around looking across, and out again."""
+    """List the stops in a room: in by the door, a circle looking outwards, a circle looking across it, and out."""
     inward = 0.5 * np.pi * room.side
     wall_y = room.side * HALF_CORRIDOR_M
     behind_wall = wall_y + room.side * (WALL_M + 0.7)
@@ -84,7 +84,7 @@ def _in_room(room: Room, z: float) -> list[tuple[float, float, float, float, flo
 
 
 def _up(plan: FloorPlan, z: float) -> list[tuple[float, float, float, float, float]]:
-    """To the foot of the stairs, up, and back west to the corridor of the next storey."""
+    """List the stops to the foot of the stairs, up, and back west to the next storey's corridor."""
     x0, x1, lane = plan.length_m + STAIRS_FROM_M, plan.length_m + STAIRS_TO_M, 0.5 * HALF_CORRIDOR_M
     top = z + STOREY_M
     return [
@@ -97,13 +97,13 @@ def _up(plan: FloorPlan, z: float) -> list[tuple[float, float, float, float, flo
     ]
 
 
-def way_zone_m(room: Room) -> NDArray[np.float64]:
-    """(n, 2, 2) rectangles of a room that the robot drives through, with clearance."""
+def route_zone_m(room: Room) -> NDArray[np.float64]:
+    """Return (n, 2, 2) rectangles that cover the robot's route through a room, with clearance."""
     reach = REACH_M + 0.35
     x, y = room.center_m.tolist()
     rectangles = [((x - reach, y - reach), (x + reach, y + reach))]
     entrance = np.array([room.door_x_m, room.side * (HALF_CORRIDOR_M + WALL_M + 0.7)])
-    # From behind the door the robot drives straight to the circle's nearest point: squares along that way.
+    # From behind the door the robot drives straight to the circle's nearest point; squares cover that line.
     goal = np.array([x, y - room.side * REACH_M])
     for share in np.linspace(0, 1, 12):
         at = entrance + share * (goal - entrance)

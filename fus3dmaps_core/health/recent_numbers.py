@@ -1,12 +1,12 @@
-"""Numbers of the last seconds."""
+"""The numbers of the last few seconds, from which rates, means and shares are computed."""
 
 from __future__ import annotations
 
 from collections import deque
 
 
-class SlidingWindow:
-    """Keeps the numbers that came within a span of time. Not thread-safe: callers hold a lock."""
+class RecentNumbers:
+    """The numbers that came within the last ``length_s`` seconds. Not thread-safe: callers hold a lock."""
 
     def __init__(self, length_s: float) -> None:
         """Start empty.
@@ -18,12 +18,12 @@ class SlidingWindow:
         self._numbers: deque[tuple[float, float]] = deque()
 
     def add(self, now_s: float, number: float = 1.0) -> None:
-        """Keep a number; ``now_s`` must not go back."""
+        """Add a number; ``now_s`` must not go back."""
         self._numbers.append((now_s, number))
         self._forget(now_s)
 
     def numbers(self, now_s: float) -> list[float]:
-        """The numbers that came less than the window's length ago, oldest first."""
+        """List the numbers that came less than ``length_s`` ago, oldest first."""
         self._forget(now_s)
         return [number for _, number in self._numbers]
 

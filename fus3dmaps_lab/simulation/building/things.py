@@ -1,7 +1,7 @@
-"""Furniture and small things as boxes with parts.
+"""Furniture and small things, made of boxes with parts.
 
-Every thing stands in its own frame: x to its right, y to its back, z up, the origin below the middle of its back edge, where
-it stands; it faces south.
+A thing has its own frame: x to its right, y to its back, z up, the origin at the middle of its back edge on the floor. It
+faces south.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Thing:
-    """What can be put into a room.
+    """A thing that can be put into a room.
 
     Attributes:
-        class_name: What it is.
+        class_name: Name of its class.
         size_m: Width, depth and height.
         pieces: Its boxes.
-        top_m: Height of the surface that other things can stand on; 0 for none.
+        top_m: Height of the surface on which other things can stand; 0 for none.
     """
 
     class_name: str
@@ -65,7 +65,7 @@ def _legs(width: float, depth: float, height: float, thick: float, color: Color,
 
 
 def chair(rng: Rng) -> Thing:
-    """Seat, back and legs."""
+    """Make a chair: seat, back and legs."""
     color, legs = _fabric(rng), _wood(rng)
     pieces = [
         Piece("seat", (-0.22, -0.46, 0.43), (0.22, 0, 0.48), color),
@@ -76,14 +76,14 @@ def chair(rng: Rng) -> Thing:
 
 
 def stool(rng: Rng) -> Thing:
-    """Seat and legs."""
+    """Make a stool: seat and legs."""
     color = _wood(rng)
     pieces = [Piece("seat", (-0.17, -0.34, 0.6), (0.17, 0, 0.64), color), *_legs(0.34, 0.34, 0.6, 0.035, color)]
     return Thing("stool", (0.34, 0.34, 0.64), tuple(pieces))
 
 
 def table(rng: Rng) -> Thing:
-    """Top and legs."""
+    """Make a table: top and legs."""
     width, depth, color = float(rng.uniform(1.0, 1.5)), float(rng.uniform(0.7, 0.85)), _wood(rng)
     half = 0.5 * width
     pieces = [Piece("top", (-half, -depth, 0.7), (half, 0, 0.74), color), *_legs(width, depth, 0.7, 0.06, color)]
@@ -91,7 +91,7 @@ def table(rng: Rng) -> Thing:
 
 
 def desk(rng: Rng) -> Thing:
-    """Top, legs and drawers."""
+    """Make a desk: top, legs and drawers."""
     width, color = float(rng.uniform(1.2, 1.6)), _wood(rng)
     half = 0.5 * width
     pieces = [
@@ -103,7 +103,7 @@ def desk(rng: Rng) -> Thing:
 
 
 def sofa(rng: Rng) -> Thing:
-    """Seat, back and arms."""
+    """Make a sofa: seat, back and arms."""
     width, color = float(rng.uniform(1.6, 2.1)), _fabric(rng)
     half = 0.5 * width
     pieces = [
@@ -116,7 +116,7 @@ def sofa(rng: Rng) -> Thing:
 
 
 def armchair(rng: Rng) -> Thing:
-    """Seat, back and arms."""
+    """Make an armchair: seat, back and arms."""
     color = _fabric(rng)
     pieces = [
         Piece("seat", (-0.26, -0.78, 0.08), (0.26, -0.2, 0.42), color),
@@ -128,7 +128,7 @@ def armchair(rng: Rng) -> Thing:
 
 
 def bed(rng: Rng) -> Thing:
-    """Frame, mattress and headboard; its long side is at the wall, so that a robot can pass in a small room."""
+    """Make a bed: frame, mattress and headboard. Its long side is at the wall, so that a robot can pass in a small room."""
     wood = _wood(rng)
     pieces = [
         Piece("frame", (-0.94, -0.95, 0.08), (1.0, 0, 0.32), wood),
@@ -150,27 +150,27 @@ def _doored(name: str, width: float, depth: float, height: float, doors: int, co
 
 
 def cabinet(rng: Rng) -> Thing:
-    """Body and doors; things can stand on it."""
+    """Make a cabinet: body and doors; things can stand on it."""
     return _doored("cabinet", float(rng.uniform(0.9, 1.5)), 0.45, float(rng.uniform(0.75, 0.9)), 3, _wood(rng), True)
 
 
 def wardrobe(rng: Rng) -> Thing:
-    """Body and two doors, as high as a person."""
+    """Make a wardrobe: body and two doors, as high as a person."""
     return _doored("wardrobe", float(rng.uniform(1.0, 1.4)), 0.6, 2.0, 2, _wood(rng), False)
 
 
 def refrigerator(rng: Rng) -> Thing:
-    """Body and door."""
+    """Make a refrigerator: body and door."""
     return _doored("refrigerator", 0.6, 0.62, 1.8, 1, _near(((214, 218, 222), (150, 154, 160)), rng), False)
 
 
 def nightstand(rng: Rng) -> Thing:
-    """Body and a door; things can stand on it."""
+    """Make a nightstand: body and a door; things can stand on it."""
     return _doored("nightstand", 0.45, 0.4, 0.5, 1, _wood(rng), True)
 
 
 def washing_machine(rng: Rng) -> Thing:
-    """Body and its porthole."""
+    """Make a washing machine: body and porthole."""
     pieces = (
         Piece("body", (-0.3, -0.57, 0), (0.3, 0, 0.85), _WHITE),
         Piece("door 0", (-0.18, -0.6, 0.28), (0.18, -0.57, 0.64), _BLACK),
@@ -179,7 +179,7 @@ def washing_machine(rng: Rng) -> Thing:
 
 
 def counter(rng: Rng) -> Thing:
-    """A kitchen counter: body and worktop; things can stand on it."""
+    """Make a kitchen counter: body and worktop; things can stand on it."""
     width, color = float(rng.uniform(1.2, 1.8)), _near(((232, 228, 218), (120, 140, 130)), rng)
     half = 0.5 * width
     pieces = (
@@ -190,7 +190,7 @@ def counter(rng: Rng) -> Thing:
 
 
 def oven(rng: Rng) -> Thing:
-    """Body, door and hob."""
+    """Make an oven: body, door and hob."""
     pieces = (
         Piece("body", (-0.3, -0.57, 0), (0.3, 0, 0.88), _METAL),
         Piece("door 0", (-0.26, -0.6, 0.2), (0.26, -0.57, 0.66), _BLACK),
@@ -200,7 +200,7 @@ def oven(rng: Rng) -> Thing:
 
 
 def sink(rng: Rng) -> Thing:
-    """Basin, pedestal and tap."""
+    """Make a sink: basin, pedestal and tap."""
     pieces = (
         Piece("basin", (-0.28, -0.46, 0.72), (0.28, 0, 0.86), _WHITE),
         Piece("pedestal", (-0.1, -0.3, 0), (0.1, -0.05, 0.72), _WHITE),
@@ -210,7 +210,7 @@ def sink(rng: Rng) -> Thing:
 
 
 def toilet(rng: Rng) -> Thing:
-    """Bowl and cistern."""
+    """Make a toilet: bowl and cistern."""
     pieces = (
         Piece("bowl", (-0.19, -0.66, 0), (0.19, -0.18, 0.42), _WHITE),
         Piece("cistern", (-0.2, -0.18, 0), (0.2, 0, 0.82), _WHITE),
@@ -219,7 +219,7 @@ def toilet(rng: Rng) -> Thing:
 
 
 def bathtub(rng: Rng) -> Thing:
-    """Four walls around a floor."""
+    """Make a bathtub: four walls around a floor."""
     pieces = (
         Piece("tub", (-0.8, -0.75, 0), (0.8, 0, 0.25), _WHITE),
         Piece("rim", (-0.8, -0.75, 0.25), (0.8, -0.68, 0.56), _WHITE),
@@ -231,7 +231,7 @@ def bathtub(rng: Rng) -> Thing:
 
 
 def bookshelf(rng: Rng) -> Thing:
-    """Boards and a back; its books are instances of their own."""
+    """Make a bookshelf: boards and a back. Its books are instances of their own."""
     color = _wood(rng)
     pieces = [Piece("back", (-0.5, -0.02, 0), (0.5, 0, 1.8), color)]
     pieces += [Piece("sides", (x, -0.32, 0), (x + 0.03, -0.02, 1.8), color) for x in (-0.5, 0.47)]
@@ -240,11 +240,11 @@ def bookshelf(rng: Rng) -> Thing:
 
 
 SHELF_HEIGHTS_M = (0.05, 0.5, 0.95, 1.4)
-"""Where the boards of a bookshelf are, from below."""
+"""Heights of the boards of a bookshelf, from below."""
 
 
 def floor_lamp(rng: Rng) -> Thing:
-    """Base, pole and shade."""
+    """Make a floor lamp: base, pole and shade."""
     pieces = (
         Piece("base", (-0.14, -0.34, 0), (0.14, -0.06, 0.03), _METAL),
         Piece("pole", (-0.02, -0.22, 0.03), (0.02, -0.18, 1.3), _METAL),
@@ -254,7 +254,7 @@ def floor_lamp(rng: Rng) -> Thing:
 
 
 def plant(rng: Rng) -> Thing:
-    """Pot and leaves."""
+    """Make a plant: pot and leaves."""
     green = _near(((70, 120, 60), (90, 140, 80)), rng)
     pieces = (
         Piece("pot", (-0.15, -0.3, 0), (0.15, 0, 0.3), _near(((170, 96, 70),), rng)),
@@ -265,12 +265,12 @@ def plant(rng: Rng) -> Thing:
 
 
 def trash_can(rng: Rng) -> Thing:
-    """A bin."""
+    """Make a trash can."""
     return Thing("trash can", (0.28, 0.28, 0.42), (Piece("bin", (-0.14, -0.28, 0), (0.14, 0, 0.42), _BLACK),))
 
 
 def box(rng: Rng) -> Thing:
-    """A cardboard box on the floor."""
+    """Make a cardboard box for the floor."""
     width, height = float(rng.uniform(0.35, 0.6)), float(rng.uniform(0.3, 0.5))
     color = _near(((176, 140, 96),), rng)
     return Thing("box", (width, 0.4, height), (Piece("box", (-0.5 * width, -0.4, 0), (0.5 * width, 0, height), color),))
@@ -282,7 +282,7 @@ def _block(name: str, size: tuple[float, float, float], color: Color) -> Thing:
 
 
 def mug(rng: Rng) -> Thing:
-    """Body and handle."""
+    """Make a mug: body and handle."""
     color = _bright(rng)
     pieces = (
         Piece("body", (-0.05, -0.1, 0), (0.05, 0, 0.12), color),
@@ -292,7 +292,7 @@ def mug(rng: Rng) -> Thing:
 
 
 def bottle(rng: Rng) -> Thing:
-    """Body and neck."""
+    """Make a bottle: body and neck."""
     color = _near(((60, 110, 70), (120, 70, 50), (150, 180, 200)), rng)
     pieces = (
         Piece("body", (-0.05, -0.1, 0), (0.05, 0, 0.2), color),
@@ -302,22 +302,22 @@ def bottle(rng: Rng) -> Thing:
 
 
 def vase(rng: Rng) -> Thing:
-    """A vase."""
+    """Make a vase."""
     return _block("vase", (0.14, 0.14, 0.28), _bright(rng))
 
 
 def bowl(rng: Rng) -> Thing:
-    """A bowl."""
+    """Make a bowl."""
     return _block("bowl", (0.24, 0.24, 0.09), _bright(rng))
 
 
 def book(rng: Rng) -> Thing:
-    """A book that lies."""
+    """Make a lying book."""
     return _block("book", (0.2, 0.28, 0.05), _bright(rng))
 
 
 def monitor(rng: Rng) -> Thing:
-    """Screen and stand."""
+    """Make a monitor: screen and stand."""
     pieces = (
         Piece("stand", (-0.12, -0.2, 0), (0.12, -0.02, 0.02), _BLACK),
         Piece("stand", (-0.03, -0.13, 0.02), (0.03, -0.09, 0.14), _BLACK),
@@ -327,12 +327,12 @@ def monitor(rng: Rng) -> Thing:
 
 
 def keyboard(rng: Rng) -> Thing:
-    """A keyboard."""
+    """Make a keyboard."""
     return _block("keyboard", (0.44, 0.15, 0.03), _near(((60, 62, 66), (210, 210, 206)), rng))
 
 
 def table_lamp(rng: Rng) -> Thing:
-    """Base and shade."""
+    """Make a table lamp: base and shade."""
     pieces = (
         Piece("base", (-0.04, -0.16, 0), (0.04, -0.08, 0.22), _METAL),
         Piece("shade", (-0.12, -0.24, 0.22), (0.12, 0, 0.42), _near(((246, 236, 212),), rng)),
@@ -341,7 +341,7 @@ def table_lamp(rng: Rng) -> Thing:
 
 
 def microwave(rng: Rng) -> Thing:
-    """Body and door."""
+    """Make a microwave: body and door."""
     pieces = (
         Piece("body", (-0.24, -0.33, 0), (0.24, 0, 0.28), _METAL),
         Piece("door 0", (-0.22, -0.35, 0.03), (0.1, -0.33, 0.25), _BLACK),
@@ -350,12 +350,12 @@ def microwave(rng: Rng) -> Thing:
 
 
 def kettle(rng: Rng) -> Thing:
-    """A kettle."""
+    """Make a kettle."""
     return _block("kettle", (0.17, 0.17, 0.24), _near(((190, 192, 196), (40, 40, 44)), rng))
 
 
 def television(rng: Rng) -> Thing:
-    """Screen and foot."""
+    """Make a television: screen and foot."""
     pieces = (
         Piece("foot", (-0.25, -0.2, 0), (0.25, -0.04, 0.05), _BLACK),
         Piece("screen", (-0.5, -0.14, 0.05), (0.5, -0.08, 0.62), _BLACK),
@@ -364,17 +364,17 @@ def television(rng: Rng) -> Thing:
 
 
 def pillow(rng: Rng) -> Thing:
-    """A pillow that lies."""
+    """Make a lying pillow."""
     return _block("pillow", (0.45, 0.32, 0.14), _bright(rng))
 
 
 def towel(rng: Rng) -> Thing:
-    """A folded towel."""
+    """Make a folded towel."""
     return _block("towel", (0.36, 0.26, 0.1), _bright(rng))
 
 
 def picture(rng: Rng) -> Thing:
-    """Frame and canvas, for a wall."""
+    """Make a picture for a wall: frame and canvas."""
     width, height = float(rng.uniform(0.5, 0.9)), float(rng.uniform(0.4, 0.7))
     half = 0.5 * width
     pieces = (
@@ -385,7 +385,7 @@ def picture(rng: Rng) -> Thing:
 
 
 def rug(rng: Rng) -> Thing:
-    """A thin carpet."""
+    """Make a thin carpet."""
     return _block("rug", (1.3, 1.3, 0.03), _fabric(rng))
 
 
