@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 def similarity_colors(similarity: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Colours (n, 3) uint8 RGB of similarities (n,), on the turbo scale between their smallest and largest value."""
+    """Color similarities (n,) on the turbo scale between their smallest and largest value: (n, 3) uint8 RGB."""
     if not len(similarity):
         return np.zeros((0, 3), np.uint8)
     low, high = float(similarity.min()), float(similarity.max())

@@ -247,7 +247,7 @@ def _answer(
 
 
 def _ranked(query: TextQuery, found: Finding) -> list[RankedInstance]:
-    """The best instances of all prompts, merged."""
+    """Merge the best instances of all prompts."""
     ranked: list[tuple[float, int, int, RankedInstance]] = []
     for order, (prompt, (places, scores)) in enumerate(zip(query.prompts, found.best, strict=True)):
         for place, score in zip(places.tolist(), scores.tolist(), strict=True):

@@ -47,7 +47,7 @@ class _View:
     height: int
 
     def project(self, points_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Pixels (n, 2) of points in the map frame; NaN behind the camera."""
+        """Project points in the map frame to pixels (n, 2); NaN behind the camera."""
         camera = np.asarray(points_m, np.float64) @ self.R.T + self.t
         depth = np.where(camera[:, 2] > 1e-3, camera[:, 2], np.nan)
         return camera[:, :2] / depth[:, None] * self.focal_px + (self.width / 2, self.height / 2)
@@ -143,7 +143,7 @@ def write_ply(path: Path, points_m: NDArray[np.float32], similarity: NDArray[np.
 def _orientation(
     camera_poses: NDArray[np.float64], target_m: NDArray[np.float32] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Up and mean horizontal line of sight: cameras are carried upright, whatever axis the map frame calls up."""
+    """Find up and the mean horizontal line of sight. Cameras are carried upright, whatever axis the map frame calls up."""
     up = -camera_poses[:, :3, 1].sum(axis=0) if len(camera_poses) else np.zeros(3)
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else np.array([0.0, 0.0, 1.0])
     sights = camera_poses[:, :3, 2]
@@ -162,7 +162,7 @@ def _orientation(
 def _frame_view(
     points_m: NDArray[np.float32], up: NDArray[np.float64], forward: NDArray[np.float64], width: int, height: int
 ) -> _View:
-    """A camera that looks down on the points, as near as it can be with nearly all of them in the picture."""
+    """Place a camera that looks down on the points, as near as it can be with nearly all of them in the picture."""
     sight = np.cos(_ELEVATION_RAD) * forward - np.sin(_ELEVATION_RAD) * up
     right = np.cross(sight, up)
     right /= np.linalg.norm(right)
@@ -185,7 +185,7 @@ def _frame_view(
 
 
 def _cast(points_m: NDArray[np.float32], colors: NDArray[np.uint8], voxel_size_m: float, view: _View) -> NDArray[np.uint8]:
-    """The picture of coloured cubes, shaded by the direction of their faces and averaged over 2x2 rays a pixel."""
+    """Draw coloured cubes, shaded by the direction of their faces and averaged over 2x2 rays a pixel."""
     image = np.full((view.height, view.width, 3), _BACKGROUND, np.uint8)
     if not len(points_m):
         return image
@@ -237,7 +237,7 @@ def _draw_box(image: NDArray[np.uint8], instance: RankedInstance, rank: int, vie
 
 
 def _draw_scale(image: NDArray[np.uint8], similarity: NDArray[np.float32]) -> None:
-    """A colour bar in the lower right corner."""
+    """Draw a colour bar into the lower right corner."""
     if not len(similarity):
         return
     height, width = image.shape[:2]
@@ -250,5 +250,5 @@ def _draw_scale(image: NDArray[np.uint8], similarity: NDArray[np.float32]) -> No
 
 
 def _printable(text: str) -> str:
-    """OpenCV's fonts have ASCII only."""
+    """Replace what OpenCV's fonts, which have ASCII only, cannot draw."""
     return text.encode("ascii", "replace").decode()

@@ -14,7 +14,7 @@ MAX_NAME_BYTES = 128
 
 
 def map_root(directory: str | Path) -> Path:
-    """The directory of saved maps as an absolute path, ``~`` expanded; it need not exist.
+    """Return the directory of saved maps as an absolute path, ``~`` expanded; it need not exist.
 
     Raises:
         StorageError: The home directory that it speaks of is unknown, or it cannot be a path.
@@ -26,7 +26,7 @@ def map_root(directory: str | Path) -> Path:
 
 
 def map_path(root: str | Path, name: str) -> Path:
-    """Path of the map of a name, which need not exist.
+    """Return the path of the map with a name, which need not exist.
 
     Args:
         root: Directory of saved maps (``node.map_directory``); ``~`` is expanded.
@@ -59,7 +59,7 @@ def map_path(root: str | Path, name: str) -> Path:
 
 
 def list_maps(root: str | Path) -> list[str]:
-    """Names of the maps whose manifest can be read, the newest save first; none where there is no such directory.
+    """List the names of the maps whose manifest can be read, the newest save first; none without the directory.
 
     Raises:
         StorageError: The directory cannot be listed.

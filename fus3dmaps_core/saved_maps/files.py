@@ -54,7 +54,7 @@ class _Chunks:
 
 
 def is_own_name(name: str) -> bool:
-    """Whether a file of this name, in a map's directory, is one that a save may have left."""
+    """Tell whether a file of this name, in a map's directory, is one that a save may have left."""
     return _OWN_NAME.fullmatch(name) is not None
 
 
@@ -144,7 +144,7 @@ def remove_unnamed(directory: Path) -> None:
 
 @contextmanager
 def opened(directory: Path) -> Iterator[tuple[Manifest, dict[str, BufferedReader]]]:
-    """A manifest and its array files, open; what is open stays readable while another process saves.
+    """Open a manifest and its array files. What is open stays readable while another process saves.
 
     Raises:
         StorageError: It is no map, or a file is missing; the message names it.

@@ -52,7 +52,7 @@ class ArrayFile(BaseModel):
     sha256: _Checksum
 
     def file_name(self, name: str) -> str:
-        """Name of the file that holds the array ``name``, in the map's directory."""
+        """Return the name of the file that holds the array ``name``, in the map's directory."""
         return f"{name}.{self.sha256[:DIGITS_IN_NAME]}.npy"
 
 
@@ -90,15 +90,15 @@ class Manifest(BaseModel):
     sha256: _Checksum = _NO_CHECKSUM
 
     def file_names(self) -> set[str]:
-        """Names of the array files that belong to the map."""
+        """Return the names of the array files that belong to the map."""
         return {entry.file_name(name) for name, entry in self.arrays.items()}
 
     def size_bytes(self) -> int:
-        """Bytes of the map on disk, the manifest included."""
+        """Return the bytes of the map on disk, the manifest included."""
         return sum(entry.size_bytes for entry in self.arrays.values()) + len(self.encode())
 
     def encode(self) -> bytes:
-        """The file's content, with its checksum."""
+        """Encode the file's content, with its checksum."""
         content = self.model_copy(update={"sha256": _NO_CHECKSUM}).model_dump_json(indent=1).encode()
         return content.replace(_NO_CHECKSUM.encode(), hashlib.sha256(content).hexdigest().encode())
 

@@ -1,8 +1,8 @@
-"""How a map keeps within its memory: a smaller window first, then without the voxels that were observed least.
+"""Keeping a map within its memory: first by a smaller window, then by dropping the voxels that were observed least.
 
-A map grows in steps, by blocks of embedding rows and by columns that double, so what counts is not only what it takes now
-but what it would take after the largest keyframe that can come: room is made before that, and the step is counted in full.
-Voxel keys, hypotheses and instances stay for the whole map; only the dense layer gives way to them.
+A map grows in steps, by blocks of embedding rows and by columns that double. So the budget looks at what the map would take
+after the largest keyframe that can come, and makes room before that. Voxel keys, hypotheses and instances stay for the whole
+map; only the dense layer gives way.
 """
 
 from __future__ import annotations
@@ -62,11 +62,11 @@ class MemoryUse:
     block_bytes: int
 
     def after_next(self) -> int:
-        """Most bytes allocated after the next keyframe."""
+        """Return the most bytes allocated after the next keyframe."""
         return self.lasting_next + self._dense_bytes(max(self.dense_rows, self.dense_voxels + self.new_dense_voxels))
 
     def without_slack(self) -> MemoryUse:
-        """The same once memory that no dense embedding is in was given back."""
+        """Return the same once memory without a dense embedding is given back."""
         blocks = -(-self.dense_voxels // self.block_rows)
         allocated = min(self.allocated, self.lasting + blocks * self.block_bytes)
         return MemoryUse(
@@ -93,7 +93,7 @@ class BudgetedMap(Protocol):
         ...
 
     def memory_use(self, bound: KeyframeBound) -> MemoryUse:
-        """What the map takes, and would take after a keyframe of at most this size."""
+        """Return what the map takes, and would take after a keyframe of at most this size."""
         ...
 
     def set_window_radius(self, radius_m: float) -> None:
@@ -114,7 +114,7 @@ class BudgetedMap(Protocol):
 
 
 class MemoryBudget:
-    """Keeps a map's allocated bytes within a bound, if what cannot be dropped fits. Never raises for want of memory.
+    """Keeps a map's allocated bytes within a bound, if what cannot be dropped fits. Never raises for lack of memory.
 
     A map is *near* its budget if it takes more than 90 % of it or could take more than all of it after the next keyframe.
     Then the window shrinks until the map is no longer near, down to a metre or 20 voxels, whichever is more. If that does
@@ -123,7 +123,7 @@ class MemoryBudget:
     """
 
     def __init__(self, budget_mib: float, window_radius_m: float, voxel_size_m: float, bound: KeyframeBound) -> None:
-        """Watch over nothing yet.
+        """Set the bound; :meth:`make_room` enforces it.
 
         Args:
             budget_mib: What the map may take, MiB; 0 for no bound.
@@ -167,16 +167,16 @@ class MemoryBudget:
         return beyond_window + least_observed
 
     def load(self, use: MemoryUse) -> float:
-        """Share of the budget that is taken, or for a large next step a tenth less than would be taken after it."""
+        """Return the share of the budget that is taken, or if larger, a tenth less than what the next keyframe could take."""
         reserve = (1.0 - _NEAR) * self.budget_bytes
         return max(use.allocated, use.after_next() - reserve) / self.budget_bytes
 
     def is_near(self, use: MemoryUse) -> bool:
-        """Whether the map must give way."""
+        """Tell whether the map must give way."""
         return self.load(use) > _NEAR
 
     def excess(self, use: MemoryUse) -> int:
-        """Dense embeddings to drop so that 80 % are taken; 0 for a map that is not near its budget."""
+        """Count the dense embeddings to drop so that 80 % are taken; 0 for a map that is not near its budget."""
         if not self.is_near(use):
             return 0
         target = _TARGET * self.budget_bytes
@@ -200,7 +200,7 @@ class MemoryBudget:
         return dropped
 
     def _relax(self, target: BudgetedMap) -> None:
-        """Far from the budget: widen the window again, and warn anew of the next time."""
+        """Widen the window again, far from the budget, and allow the next warning."""
         self._warned_of_drops = self._warned_of_excess = False
         if 0.0 < target.window_radius_m < self._configured_radius_m:
             target.set_window_radius(min(self._configured_radius_m, _GROW * target.window_radius_m))

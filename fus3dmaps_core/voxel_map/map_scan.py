@@ -262,7 +262,7 @@ def _highest(totals: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _largest(values: NDArray[np.float64], count: int) -> NDArray[np.int64]:
-    """Places of the largest values, largest first, equal ones in their order."""
+    """Find the places of the largest values, largest first, equal ones in their order."""
     places = np.arange(len(values))
     if len(values) > count:
         places = np.flatnonzero(values >= np.partition(values, len(values) - count)[len(values) - count])

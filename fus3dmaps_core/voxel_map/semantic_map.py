@@ -35,7 +35,7 @@ class SemanticMap:
 
     Attributes:
         dimension: Embedding width d.
-        space: Name of the encoder trio whose embeddings it holds, "" where nobody said; queries of another are refused.
+        space: Name of the encoder trio whose embeddings it holds, or "". Queries of another trio are refused.
     """
 
     def __init__(
@@ -55,7 +55,7 @@ class SemanticMap:
             variance_ratio: lambda = R^D / R^I.
             window_radius_m: Radius r_w of the sliding window, metres; 0 keeps the whole dense layer and makes fusion
                 replace every fused embedding, where a window keeps those of more evidence.
-            keep_most_evidence: False has fusion replace every fused embedding with a window too.
+            keep_most_evidence: If false, fusion replaces every fused embedding with a window, too.
             space: Name of the encoder trio whose embeddings will come.
 
         Raises:

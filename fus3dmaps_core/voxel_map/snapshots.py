@@ -1,4 +1,4 @@
-"""Copies of the map of one moment, which nobody changes: what publishers, queries and pictures work from."""
+"""Copies of the map at one moment, which never change. Publishers, queries and pictures work from them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from fus3dmaps_core.voxel_map.kernels.protocols import Extents
 
 @dataclass(frozen=True)
 class FusionReport:
-    """What one fusion did.
+    """Figures of one fusion.
 
     Attributes:
         instances: Instances alive.
@@ -76,7 +76,7 @@ class InstanceSnapshot:
 def snapshot_instances(
     ids: Tensor, weights: Tensor, hypothesis_voxels: Tensor, extents: Extents, voxel_size_m: float
 ) -> InstanceSnapshot:
-    """Instances with the place that each occupies.
+    """Describe instances by the place that each occupies.
 
     Args:
         ids: (n,) ascending ids of the instances alive.

@@ -25,7 +25,7 @@ _UNSEEN_COLOR = 128  # Voxels that only proposals have touched carry no colour o
 
 
 class MapState:
-    """One voxel hash and everything that is kept of its voxels and of the instances.
+    """One voxel hash and everything known of its voxels and of the instances.
 
     Attributes:
         hash: Voxel keys to slots.
@@ -51,7 +51,7 @@ class MapState:
         self.fused = FusedInstances(dimension, windowed, device, keep_most_evidence)
 
     def slots(self, keys: Tensor) -> Tensor:
-        """Slots of distinct keys, (n,) int64; voxels that the map lacks are made."""
+        """Look up the slots of distinct keys, (n,) int64. Voxels that the map lacks are made."""
         slots = self.hash.find_or_insert(keys)
         count = self.hash.high_water
         self.colors.reserve(count)
@@ -60,7 +60,7 @@ class MapState:
         return slots
 
     def associate(self, slots: Tensor, proposals: GroupedCounts, embeddings: Tensor, visible_keys: Tensor | None) -> Tensor:
-        """Give a keyframe's proposals to instances, then merge instances that have grown into one another if that is wanted.
+        """Give a keyframe's proposals to instances, then merge instances that have grown into one another, if configured.
 
         Args:
             slots: (n,) distinct slots of all proposals.
@@ -92,7 +92,7 @@ class MapState:
         self.hash.remove(slots)
 
     def nbytes(self) -> dict[str, int]:
-        """Allocated bytes by part; the hash counts all that a voxel takes without evidence: key, cells, link to a row."""
+        """Return the allocated bytes by part. The hash counts all that a voxel takes without evidence: key, cells, link."""
         return {
             "hash": self.hash.nbytes + self.dense.link_nbytes,
             "colors": self.colors.nbytes,
@@ -123,7 +123,7 @@ class MapState:
         )
 
     def export(self) -> dict[str, NDArray[Any]]:
-        """Everything as arrays by name, voxels in the order of their slots.
+        """Return everything as arrays by name, voxels in the order of their slots.
 
         Returns:
             voxel_coordinates (n, 3) int32; voxel_colors (n, 3) uint8; dense_slot (m,) int32, places among the n;

@@ -15,17 +15,17 @@ MAX_COORDINATE = HALF - 1
 
 
 def pack(coordinates: Tensor) -> Tensor:
-    """Keys of (n, 3) integer voxel coordinates within +-MAX_COORDINATE: (n,) int64, not negative."""
+    """Pack (n, 3) integer voxel coordinates within +-MAX_COORDINATE into keys: (n,) int64, not negative."""
     x, y, z = (coordinates.to(torch.int64) + HALF).unbind(1)
     return (x << (2 * BITS)) | (y << BITS) | z
 
 
 def unpack(keys: Tensor) -> Tensor:
-    """Voxel coordinates of keys: (n, 3) int64."""
+    """Unpack keys into voxel coordinates: (n, 3) int64."""
     mask = (1 << BITS) - 1
     return torch.stack([(keys >> (2 * BITS)) & mask, (keys >> BITS) & mask, keys & mask], dim=1) - HALF
 
 
 def home(keys: Tensor, cells: int) -> Tensor:
-    """Cell of a table of a power of two cells at which the probing for each key begins."""
+    """Find the cell at which probing for each key begins, in a table of a power of two cells."""
     return ((keys * MULTIPLIER) >> (65 - cells.bit_length())) & (cells - 1)

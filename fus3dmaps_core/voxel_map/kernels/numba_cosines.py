@@ -24,7 +24,7 @@ _CANCELLED = np.float32(0.1)
 
 @njit(**_OPTIONS)
 def _dots(values: NDArray[np.float32], texts: NDArray[np.float32], scale: np.float32, found: NDArray[np.float32]) -> None:
-    """Products of one vector with each text, times a scale; four texts to each reading of the vector."""
+    """Write the products of one vector with each text, times a scale; the vector is read once for four texts."""
     width, whole = len(values), len(texts) // 4 * 4
     for p in range(0, whole, 4):
         a, b, c, d = texts[p], texts[p + 1], texts[p + 2], texts[p + 3]

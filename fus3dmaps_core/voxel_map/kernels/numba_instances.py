@@ -29,7 +29,7 @@ def _best_match(
     shared: NDArray[np.int32],
     candidates: NDArray[np.int32],
 ) -> int:
-    """Row of the instance with the largest IoU above the threshold (ties: the lowest id), -1 without one."""
+    """Find the row of the instance with the largest IoU above the threshold (ties: the lowest id), -1 without one."""
     found = 0
     for slot in slots:
         for k in range(held_row.shape[1]):

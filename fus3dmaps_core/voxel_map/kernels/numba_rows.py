@@ -46,7 +46,7 @@ def _bits_float(typing_context: Any, bits: Any) -> Any:
 
 @njit(inline="always")
 def _dither(seed: Any, column: Any) -> Any:
-    """32 random bits for a column of a row; the same as memory.rounding.dither."""
+    """Compute 32 random bits for a column of a row, the same as rows.rounding.dither."""
     bits = np.uint32(seed + np.uint32(np.uint32(column) * np.uint32(0x9E3779B9)))
     bits = np.uint32(bits ^ np.uint32(bits >> np.uint32(16)))
     bits = np.uint32(bits * np.uint32(0x7FEB352D))
@@ -57,7 +57,7 @@ def _dither(seed: Any, column: Any) -> Any:
 
 @njit(**_OPTIONS)
 def _store(tag: Any, size: int, address: int, seed: np.uint32, scale: np.float32, values: NDArray[np.float32]) -> np.float32:
-    """Write len(values) values from an address on, rounded as memory.rounding says; returns the row's scale."""
+    """Write len(values) values from an address on, rounded as in rows.rounding; returns the row's scale."""
     n = np.int64(len(values))
     if size == 4:
         for c in range(n):
@@ -98,7 +98,7 @@ def merge_means(
     start: int,
     stop: int,
 ) -> None:
-    """rows[i] <- (old[i] rows[i] + sum over its group of amounts embeddings[sources]) / new[i], for i in [start, stop)."""
+    """Write rows[i] <- (old[i] rows[i] + sum over its group of amounts embeddings[sources]) / new[i], i in [start, stop)."""
     width, mask = np.int64(embeddings.shape[1]), np.int64((1 << shift) - 1)
     values = np.empty(width, np.float32)
     for i in range(start, stop):

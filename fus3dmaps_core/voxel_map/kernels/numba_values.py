@@ -33,7 +33,7 @@ _STORED = {types.float32: ir.FloatType(), types.uint16: ir.HalfType(), types.int
 
 @intrinsic
 def value_at(typing_context: Any, tag: Any, address: Any, index: Any) -> Any:
-    """The index-th value from an address on, as a float: one instruction where the processor knows halves."""
+    """Read the index-th value from an address on, as a float: one instruction where the processor knows halves."""
     stored = _STORED[tag]
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -80,5 +80,5 @@ def prefetch(typing_context: Any, address: Any) -> Any:
 
 
 def stored(pool: RowPool) -> tuple[Any, ...]:
-    """A pool as compiled loops take it: tag, bytes of a value, address of each block, and log2 of a block's rows."""
+    """Return a pool as compiled loops take it: tag, bytes of a value, address of each block, and log2 of a block's rows."""
     return TAGS[pool.dtype], pool.dtype.itemsize, pool.addresses, pool.block_rows.bit_length() - 1

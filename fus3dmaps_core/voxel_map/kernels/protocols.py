@@ -1,4 +1,4 @@
-"""What the map asks of its inner loops. Tensors live on one device; no call changes more than it says."""
+"""The interface of the map's inner loops. Tensors live on one device; no call changes more than it says."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor
 from fus3dmaps_core.voxel_map.rows.row_pool import RowPool
 
 EMPTY, DELETED = -1, -2
-"""Contents of cells of a hash table without a key: probing ends at an empty one and goes on past a deleted one."""
+"""Contents of cells of a hash table without a key. Probing ends at an empty cell and goes on past a deleted one."""
 
 
 MAX_COUNT = 2**31 - 1
-"""Counts of hypotheses stay here when they would grow beyond."""
+"""Largest count of a hypothesis; counts stop growing here."""
 
 SCORE_UNIT = 2**30
 """Scores are summed as integers of steps this small: whatever the order, the sum is the same, and 2^32 of them fit."""
@@ -35,7 +35,7 @@ class HashTable:
 
 @dataclass(frozen=True)
 class GroupedCounts:
-    """A sparse matrix of counts, by rows: what in which group, how often.
+    """Counts of partners in groups: a sparse matrix, stored by rows.
 
     Attributes:
         offsets: (groups + 1,) int64, where each group begins in the other two, and where the last one ends.
@@ -107,7 +107,7 @@ class SlotBlock:
 
 @dataclass(frozen=True)
 class Texts:
-    """What the voxels of a layer are compared with.
+    """The texts that the voxels of a layer are compared with.
 
     Without negatives a score is a cosine. With them it is the smallest over the negatives of
     exp(s c) / (exp(s c) + exp(s c_negative)), s being the logit scale and c the cosines.
@@ -184,7 +184,7 @@ class ScoredVoxels:
 
 @dataclass(frozen=True)
 class FusionRows:
-    """What the fusion of instances with their voxels reads, beside their own embeddings.
+    """The rows of the dense layer that instances are fused with.
 
     Attributes:
         pool: Rows f of the dense layer.
@@ -201,7 +201,7 @@ class FusionRows:
 
 @dataclass(frozen=True)
 class Association:
-    """What became of a keyframe's proposals.
+    """The result of associating a keyframe's proposals.
 
     Attributes:
         rows: (m,) int64 row of each proposal's instance, -1 for a proposal without points.
@@ -220,7 +220,7 @@ class Kernels(Protocol):
     """The inner loops of the map."""
 
     def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
-        """Packed key of the voxel of each point (n, 3): floor(p / size) per axis.
+        """Compute the packed key of the voxel of each point (n, 3): floor(p / size) per axis.
 
         Returns:
             (n,) int64 keys, and the largest coordinate's size: keys mean nothing if that is beyond MAX_COORDINATE, or NaN
@@ -229,7 +229,7 @@ class Kernels(Protocol):
         ...
 
     def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
-        """Rows (n, d) of any length scaled to unit length.
+        """Scale rows (n, d) of any length to unit length.
 
         Returns:
             (n, d) float32 and 0; or nothing of meaning and 1, a value is not finite, or 2, a row has length 0.
@@ -237,7 +237,7 @@ class Kernels(Protocol):
         ...
 
     def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distinct keys in an order that the input alone decides, the place of each input among them, and counts: int64."""
+        """Find the distinct keys, in an order that the input alone decides, the place of each input, and counts: int64."""
         ...
 
     def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
@@ -245,7 +245,7 @@ class Kernels(Protocol):
         ...
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
-        """Slots of the keys, -1 where the table lacks one: (n,) int64."""
+        """Look up the slots of the keys, -1 where the table lacks one: (n,) int64."""
         ...
 
     def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
@@ -304,11 +304,11 @@ class Kernels(Protocol):
         ...
 
     def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """Slots that hold any of some instances, (n,) int64 ascending; the arguments are those of :meth:`shared_voxels`."""
+        """Find the slots that hold any of some instances, (n,) int64 ascending; arguments as of :meth:`shared_voxels`."""
         ...
 
     def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """How many voxels each two of some instances share, in one pass over slots.
+        """Count the voxels that each two of some instances share, in one pass over slots.
 
         Args:
             held_row: (slots, K) int32 rows that each slot holds, -1 where empty.
@@ -334,11 +334,11 @@ class Kernels(Protocol):
         ...
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """Per slot the row with the highest count (ties: the lowest id; -1 without one) and that count: (n,) int64."""
+        """Find per slot the row with the highest count (ties: the lowest id; -1 without one) and that count: (n,) int64."""
         ...
 
     def scan_limit(self, texts: int) -> int:
-        """How many slots a scan may be given at a time, compared with so many texts, for its memory to stay small."""
+        """Return how many slots may be scanned at a time, compared with so many texts, for its memory to stay small."""
         ...
 
     def scan(
@@ -351,7 +351,7 @@ class Kernels(Protocol):
         threshold: float,
         room_for: ScoredVoxels,
     ) -> tuple[int, int]:
-        """Look at a block of slots once: what instances occupy, and how its voxels compare with texts.
+        """Scan a block of slots: add what instances occupy, and compare its voxels with texts.
 
         Args:
             block: The slots.
@@ -369,15 +369,15 @@ class Kernels(Protocol):
         ...
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
-        """Places, int64 ascending, of keys whose voxel's centre is farther than a radius from a point (3,) float64."""
+        """Find the keys whose voxel's centre is farther than a radius from a point (3,) float64: places, int64 ascending."""
         ...
 
     def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
-        """Centres of voxels: (n, 3) float32, metres."""
+        """Compute the centres of voxels: (n, 3) float32, metres."""
         ...
 
     def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
-        """Cosines of the rows with unit vectors (p, d): (n, p) float32."""
+        """Compute the cosines of the rows with unit vectors (p, d): (n, p) float32."""
         ...
 
     def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
@@ -386,8 +386,8 @@ class Kernels(Protocol):
         The evidence is the sum of w over these voxels, plus the amount. Where it is 0, own[row] is what is written.
 
         Args:
-            voxels: What instances are fused with.
-            rows: (n,) int64 distinct rows of the instances. What comes out for one does not depend on the others.
+            voxels: The dense rows.
+            rows: (n,) int64 distinct rows of the instances. The result for one does not depend on the others.
             own: Their own embeddings, float32.
             amounts: (n,) float64 weight of these.
             bars: (n,) float64; a row is written only where its evidence is greater.

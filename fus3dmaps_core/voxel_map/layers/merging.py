@@ -64,7 +64,7 @@ def merge_overlapping(
 def _candidates(
     kernels: Kernels, instances: InstanceLayer, slots: Tensor, overlap: float, cosine: float
 ) -> tuple[Tensor, Tensor]:
-    """Rows of pairs that meet, could share enough and are alike, in any order: two (p,) int64."""
+    """Find the rows of pairs that meet, could share enough and are alike, in any order: two (p,) int64."""
     first, second, most_shared = _meeting(kernels, instances, slots)
     possible = _at_least(most_shared, _smaller(instances, first, second), overlap)
     first, second = first.masked_select(possible), second.masked_select(possible)
@@ -78,7 +78,7 @@ def _candidates(
 def _share_enough(
     kernels: Kernels, instances: InstanceLayer, around: Tensor, first: Tensor, second: Tensor, overlap: float
 ) -> Tensor:
-    """Which pairs share enough voxels, all of which are among the given slots: (p,) bool."""
+    """Tell which pairs share enough voxels, all of which are among the given slots: (p,) bool."""
     rows, places, _ = kernels.distinct(torch.cat([first, second]))
     shared = kernels.shared_voxels(instances.held().index_select(0, around), rows, instances.pool.high_water)
     pairs = places[: len(first)] * len(rows) + places[len(first) :]
@@ -86,12 +86,12 @@ def _share_enough(
 
 
 def _smaller(instances: InstanceLayer, first: Tensor, second: Tensor) -> Tensor:
-    """Voxels of the smaller instance of each pair: (p,) int64."""
+    """Count the voxels of the smaller instance of each pair: (p,) int64."""
     return torch.minimum(instances.voxels(first), instances.voxels(second))
 
 
 def _meeting(kernels: Kernels, instances: InstanceLayer, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows of the pairs that a slot holds both of, and the most voxels that they can share: three (p,) int64."""
+    """Find the pairs of rows that one slot holds, and the most voxels that they can share: three (p,) int64."""
     held, _ = instances.hypotheses(slots)
     used = held >= 0
     rows, found, here = kernels.distinct(held.masked_select(used))
@@ -108,12 +108,12 @@ def _meeting(kernels: Kernels, instances: InstanceLayer, slots: Tensor) -> tuple
 
 
 def _at_least(shared: Tensor, size: Tensor, overlap: float) -> Tensor:
-    """Whether a share is large enough; correctly rounded, so that 1/5 is 0.2."""
+    """Tell whether a share is large enough; correctly rounded, so that 1/5 is 0.2."""
     return shared.to(torch.float64) / size.to(torch.float64) >= overlap
 
 
 def _one_pass(instances: InstanceLayer, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """Rows of those of the pairs that one pass merges: what is gone, and the older one that takes it in; two (n,) int64."""
+    """Choose the pairs that one pass merges: the row that is gone, and the older one that takes it in; two (n,) int64."""
     ids = torch.stack([instances.ids(first), instances.ids(second)], dim=1).tolist()
     by_id = [
         (min(pair), max(pair), rows if pair[0] > pair[1] else rows[::-1])
