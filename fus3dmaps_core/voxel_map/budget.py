@@ -167,7 +167,7 @@ class MemoryBudget:
         return beyond_window + least_observed
 
     def load(self, use: MemoryUse) -> float:
-        """Return the share of the budget that is taken, or if larger, a tenth less than what the next keyframe could take."""
+        """Return the share of the budget that is taken, or a tenth less than the next keyframe could make it, if larger."""
         reserve = (1.0 - _NEAR) * self.budget_bytes
         return max(use.allocated, use.after_next() - reserve) / self.budget_bytes
 

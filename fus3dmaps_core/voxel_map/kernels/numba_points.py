@@ -71,7 +71,7 @@ def farther(
 def distinct(
     keys: NDArray[np.int64], unique: NDArray[np.int64], inverse: NDArray[np.int64], counts: NDArray[np.int64]
 ) -> int:
-    """Number the distinct keys in the order in which they appear first; returns how many there are."""
+    """Write the distinct keys and their counts in the order of first appearance; returns how many there are."""
     capacity = 16
     while capacity < 2 * len(keys):
         capacity *= 2
