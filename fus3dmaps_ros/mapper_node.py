@@ -19,11 +19,12 @@ from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import ConfigError
+from fus3dmaps_core.ledger import Drops, Ledger
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.sources.streams import uses_tf
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
-from fus3dmaps_ros.node.drops import DropLog
+from fus3dmaps_ros.node.drop_log import DropLog
 from fus3dmaps_ros.node.executor import CallbackExecutor
 from fus3dmaps_ros.node.lifecycle import UNCONFIGURED, ManagedNode
 from fus3dmaps_ros.node.map_store import read_newest
@@ -77,7 +78,7 @@ class MapperNode(ManagedNode):
         self._inputs: Inputs | None = None
         self._watch: Watch | None = None
         self.autosave: Autosave | None = None
-        self.drops = DropLog(logger.warning)
+        self.drops = Drops(DropLog(logger.warning).report)
         self.config = declare_parameters(self)
         for sentence in unknown_overrides(self):
             logger.warning(sentence)
@@ -113,7 +114,7 @@ class MapperNode(ManagedNode):
         started = time.monotonic()
         pipeline = self._make_pipeline(config)
         logger.info(f"models loaded in {time.monotonic() - started:.1f} s")
-        session = Session(pipeline, FrameWorker(pipeline, config.node.queue_size, self.drops))
+        session = Session(pipeline, FrameWorker(pipeline, config.node.queue_size, Ledger(self.drops)))
         session.worker.start()
         self._sessions.replace(session)
         if self.config is not config:
@@ -138,7 +139,8 @@ class MapperNode(ManagedNode):
         """
         self._inputs = Inputs(self, self.config, self.worker.offer, self.drops, self._arrived)
         self._watch = Watch(self, self.config, self._inputs.streams, self._sessions.require())
-        self.worker.observer, self.drops.observe = self._watch, self._watch.dropped
+        self.worker.observer = self._watch
+        self.drops.tell(self._watch.dropped)
         self.get_logger().info("ready")
 
     def deactivate(self) -> None:
@@ -146,12 +148,13 @@ class MapperNode(ManagedNode):
         inputs, self._inputs = self._inputs, None
         if inputs is not None:
             inputs.close()
-        session, watch = self.session, self._watch
+        session = self.session
         if session is not None:
             session.worker.drop_waiting()
             session.worker.observer = None
-        self.drops.observe, self._watch = None, None
+        watch, self._watch = self._watch, None
         if watch is not None:
+            self.drops.stop_telling(watch.dropped)
             watch.close()
 
     def cleanup(self) -> None:

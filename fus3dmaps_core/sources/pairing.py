@@ -10,6 +10,7 @@ from typing import Any
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages import fields as messages
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
@@ -76,12 +77,12 @@ class FramePairer:
         ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without loss of a frame:
         ``time_jump``, ``intrinsics_changed``, ``frame_id_changed``.
         """
-        return self._tally.drops
+        return self._tally.drops.counts()
 
     @property
     def last_drop(self) -> dict[str, str]:
         """The latest explanation of each reason; names the topic."""
-        return self._tally.last_drop
+        return self._tally.drops.latest()
 
     @property
     def waiting(self) -> int:
@@ -156,6 +157,10 @@ class FramePairer:
     def drop(self, error: FrameError) -> None:
         """Count a message that cannot be used."""
         self._tally.drop(error)
+
+    def hand_over_drops(self, drops: Drops) -> None:
+        """Move the counts of :attr:`drops` to another count: each reason once, with its number and latest explanation."""
+        self._tally.drops.pour_into(drops)
 
     def _start_anew(self) -> None:
         for camera in self._cameras:

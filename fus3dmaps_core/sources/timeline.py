@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages import fields as messages
 
 _TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours; only another clock or a restart goes back this far.
@@ -20,17 +21,14 @@ class Tally:
     Attributes:
         received: Messages per topic, usable or not.
         drops: What led to no frame or was noteworthy, by reason.
-        last_drop: The latest explanation of each reason; names the topic.
     """
 
     received: Counter[str] = field(default_factory=Counter)
-    drops: Counter[str] = field(default_factory=Counter)
-    last_drop: dict[str, str] = field(default_factory=dict)
+    drops: Drops = field(default_factory=Drops)
 
     def drop(self, error: FrameError) -> None:
         """Count a message that cannot be used."""
-        self.drops[error.reason] += 1
-        self.last_drop[error.reason] = str(error)
+        self.drops.add(error.reason, str(error))
 
 
 class Timeline:

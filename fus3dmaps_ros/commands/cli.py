@@ -98,26 +98,28 @@ def map_(
 
     semantic_map = pipeline.semantic_map
     table = Table("stage", "s", "share", title=f"{out}", title_justify="left")
-    for stage, seconds in sorted(summary.stages_s.items(), key=lambda item: -item[1]):
+    ledger, counts = summary.ledger, summary.ledger.counts()
+    for stage, seconds in sorted(ledger.stages_s().items(), key=lambda item: -item[1]):
         table.add_row(stage, f"{seconds:.2f}", f"{100 * seconds / summary.duration_s:.1f} %")
     _out.print(table)
     _out.print(
-        f"{summary.frames} frames, {summary.dense_keyframes} dense and {summary.instance_keyframes} instance keyframes in "
+        f"{counts.frames} frames, {counts.dense_keyframes} dense and {counts.instance_keyframes} instance keyframes in "
         f"{summary.duration_s:.1f} s ({summary.keyframes_per_s:.2f} keyframes/s); {semantic_map.voxel_count} voxels, "
         f"{semantic_map.instance_count} instances, {sum(semantic_map.nbytes().values()) / 1e6:.0f} MB"
     )
-    for reason, count in summary.drops.most_common():
-        _log.print(f"dropped {count}, {reason}: {summary.last_drop.get(reason, '')}", markup=False, style="yellow")
+    latest = ledger.drops.latest()
+    for reason, count in ledger.drops.counts().most_common():
+        _log.print(f"dropped {count}, {reason}: {latest[reason]}", markup=False, style="yellow")
     if json_file is not None:
         figures = {
-            "frames": summary.frames,
-            "dense_keyframes": summary.dense_keyframes,
-            "instance_keyframes": summary.instance_keyframes,
-            "proposals": summary.proposals,
+            "frames": counts.frames,
+            "dense_keyframes": counts.dense_keyframes,
+            "instance_keyframes": counts.instance_keyframes,
+            "proposals": counts.proposals,
             "duration_s": summary.duration_s,
             "keyframes_per_s": summary.keyframes_per_s,
-            "stages_s": dict(summary.stages_s),
-            "drops": dict(summary.drops),
+            "stages_s": ledger.stages_s(),
+            "drops": dict(ledger.drops.counts()),
             "voxels": semantic_map.voxel_count,
             "dense_voxels": semantic_map.dense_voxel_count,
             "instances": semantic_map.instance_count,

@@ -13,11 +13,11 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.ledger import FrameCounts
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
 from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.node.timers import change_period
-from fus3dmaps_ros.node.worker import WorkerCounts
 
 _QOS = QoSProfile(
     history=HistoryPolicy.KEEP_LAST,
@@ -66,7 +66,7 @@ def status_message(
     )
     if session is not None:
         message.encoder = session.pipeline.trio.name
-        counts, times = session.worker.counts(), session.worker.stage_times()
+        counts, times = session.worker.ledger.counts(), session.worker.ledger.stage_times()
         message.frames, message.not_keyframes = counts.frames, counts.not_keyframes
         message.dense_keyframes, message.instance_keyframes = counts.dense_keyframes, counts.instance_keyframes
         message.queue_depth = session.worker.waiting
@@ -85,7 +85,7 @@ def status_message(
 
 def status_line(session: Session | None, drops: Mapping[str, int]) -> str:
     """One line on what came in, what was mapped, what was dropped and how large the map is."""
-    counts = session.worker.counts() if session else WorkerCounts()
+    counts = session.worker.ledger.counts() if session else FrameCounts()
     waiting = session.worker.waiting if session else 0
     voxels = session.pipeline.semantic_map.voxel_count if session else 0
     instances = session.pipeline.semantic_map.instance_count if session else 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -17,10 +16,10 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from fus3dmaps_core.config.input import QosProfile
 from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages.fields import stamp_ns
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
 from fus3dmaps_core.sources.streams import InputStream, uses_tf
-from fus3dmaps_ros.node.drops import DropLog
 from fus3dmaps_ros.topics.tf_poses import TfListener
 
 _TYPES: dict[str, type[Any]] = {
@@ -55,7 +54,7 @@ class Inputs:
         node: Node,
         config: Config,
         take: Callable[[PairedMessages], None],
-        drops: DropLog,
+        drops: Drops,
         arrived: Callable[[str, int], None] | None = None,
     ) -> None:
         """Subscribe.
@@ -75,7 +74,6 @@ class Inputs:
         self._take = take
         self._drops = drops
         self._arrived = arrived
-        self._reported: Counter[str] = Counter()
         self._tf = TfListener(node) if uses_tf(config.input) else None
         self._pairer = FramePairer(config.input, self._tf)
         group = MutuallyExclusiveCallbackGroup()
@@ -128,14 +126,8 @@ class Inputs:
         """Offer the frames that are complete and report what was dropped."""
         with self._lock:
             ready = self._pairer.poll()
-            news = {
-                reason: (count - self._reported[reason], self._pairer.last_drop[reason])
-                for reason, count in self._pairer.drops.items()
-                if count > self._reported[reason]
-            }
-            self._reported = Counter(self._pairer.drops)
-        for reason, (number, sentence) in news.items():
-            self._drops.count(reason, sentence, number)
+        # Together: many images that are given up at once are one line in the log.
+        self._pairer.hand_over_drops(self._drops)
         for paired in ready:
             self._take(paired)
 
