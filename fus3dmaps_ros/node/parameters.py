@@ -15,33 +15,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fus3dmaps_core.config.schema import Config, fields
+from fus3dmaps_core.config.section import Changes, when_it_changes
 from fus3dmaps_core.errors import ConfigError
-
-RUNTIME = frozenset(
-    {
-        "segmenter.min_area_px",
-        "segmenter.max_border_contact",
-        "segmenter.max_masks",
-        "keyframes.dense_translation_m",
-        "keyframes.dense_rotation_rad",
-        "keyframes.instance_translation_m",
-        "keyframes.instance_rotation_rad",
-        "map.memory_budget_mib",
-        "fusion.period_frames",
-        "query.top_k",
-        "query.min_voxels",
-        "node.publish_period_s",
-        "node.status_period_s",
-        "node.service_timeout_s",
-        "node.map_directory",
-        "node.autosave_period_s",
-    }
-)
-"""Keys that can be changed at any time. All others shape the models, the map or the graph, and can be changed while the node
-is unconfigured."""
-
-FIXED = frozenset({"node.autostart"})
-"""Keys that only matter at the start."""
 
 _TYPES = {
     bool: Parameter.Type.BOOL,
@@ -63,7 +38,7 @@ def declare_parameters(node: Node) -> Config:
     values: dict[str, Any] = {}
     for key, field in fields().items():
         try:
-            value = node.declare_parameter(key, field.default, _descriptor(key, field)).value
+            value = node.declare_parameter(key, field.default, _descriptor(field)).value
         except InvalidParameterTypeException:
             given = node._parameter_overrides[key]
             raise ConfigError(
@@ -102,7 +77,7 @@ def follow_changes(
         node: Whose parameters to watch.
         read: Gives the configuration in force.
         apply: Takes the new one.
-        is_configured: Whether the node has models and a map, which parameters outside of RUNTIME would not fit any more.
+        is_configured: Whether the node has models and a map, which only fit parameters that change at any time.
     """
     known = fields()
 
@@ -115,8 +90,8 @@ def follow_changes(
             new, present = changed(parameters).flat(), read().flat()
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        for key in known:
-            if new[key] != present[key] and key not in RUNTIME and is_configured():
+        for key, field in known.items():
+            if new[key] != present[key] and when_it_changes(field) != Changes.ANY_TIME and is_configured():
                 return SetParametersResult(
                     successful=False,
                     reason=f"parameter '{key}' can be changed only while the node is unconfigured: deactivate and clean up"
@@ -128,8 +103,9 @@ def follow_changes(
     node.add_post_set_parameters_callback(lambda parameters: apply(changed(parameters)))
 
 
-def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=field.description or "", read_only=key in FIXED)
+def _descriptor(field: FieldInfo) -> ParameterDescriptor:
+    changes = when_it_changes(field)
+    descriptor = ParameterDescriptor(description=field.description or "", read_only=changes == Changes.NEVER)
     lower: float | None = None
     upper: float | None = None
     exclusive = []
@@ -146,7 +122,7 @@ def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
                 upper = limit  # type: ignore[assignment]
                 exclusive.append(f"< {limit}")
     # ROS ranges are closed; the schema refuses the open end itself.
-    when = [] if key in RUNTIME | FIXED else ["changes only while the node is unconfigured"]
+    when = ["changes only while the node is unconfigured"] if changes == Changes.UNCONFIGURED else []
     descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive, *when])
     if lower is None and upper is None:
         return descriptor
