@@ -3,36 +3,26 @@
 from __future__ import annotations
 
 import gc
-import os
 import sys
 import time
-import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import rclpy
 import torch
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_core.ledger import Drops, Ledger
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.sources.streams import uses_tf
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
 from fus3dmaps_ros.node.drop_log import DropLog
-from fus3dmaps_ros.node.executor import CallbackExecutor
 from fus3dmaps_ros.node.lifecycle import UNCONFIGURED, ManagedNode
-from fus3dmaps_ros.node.map_store import read_newest
+from fus3dmaps_ros.node.map_store import resume_newest
 from fus3dmaps_ros.node.parameters import declare_parameters, follow_changes, unknown_overrides
-from fus3dmaps_ros.node.refusals import REFUSALS, one_line
+from fus3dmaps_ros.node.process import run_node
 from fus3dmaps_ros.node.session import Session, SessionHolder
-from fus3dmaps_ros.node.signals import StopSignals
-from fus3dmaps_ros.node.timed_calls import Deadline
 from fus3dmaps_ros.node.worker import FrameWorker
 from fus3dmaps_ros.reporting.status import StatusPublisher, status_line, status_message
 from fus3dmaps_ros.reporting.watch import Watch
@@ -43,8 +33,6 @@ from fus3dmaps_ros.topics.outputs import Outputs
 from fus3dmaps_ros.topics.tf_poses import import_tf2_ros
 
 NODE_NAME = "fus3dmaps"
-_STOP_TIMEOUT_S = 1.0
-_POLL_S = 0.05
 
 
 class MapperNode(ManagedNode):
@@ -86,6 +74,11 @@ class MapperNode(ManagedNode):
         self._status = StatusPublisher(self, self._read_config, self.status_message, self._log_line)
 
     @property
+    def autostart(self) -> bool:
+        """Whether it maps at once, without a lifecycle manager."""
+        return self.config.node.autostart
+
+    @property
     def session(self) -> Session | None:
         """Models, map and mapping thread; None while unconfigured."""
         return self._sessions.current
@@ -120,7 +113,7 @@ class MapperNode(ManagedNode):
         if self.config is not config:
             self._apply_config(self.config)  # Set while the models were loaded.
         if config.node.resume:
-            self._resume(session)
+            resume_newest(session, config.node.map_directory, logger)
         self.autosave = Autosave(session, self._read_config, logger)
         self.autosave.start()
         if self._outputs is None:
@@ -195,15 +188,7 @@ class MapperNode(ManagedNode):
             the process ends in it, the map that was saved before is left.
         """
         autosave = self.autosave
-        if autosave is None:
-            return True
-        if autosave.is_due:
-            self.get_logger().info("saving the map; another signal ends at once")
-        deadline = Deadline(self.config.node.service_timeout_s)
-        while not autosave.stop(min(_POLL_S, deadline.remaining_s()), save=True):
-            if hurried() or not deadline.remaining_s():
-                return False
-        return True
+        return autosave is None or autosave.save_last(self.config.node.service_timeout_s, hurried)
 
     def status(self) -> str:
         """One line on what came in, what was mapped, what was dropped and how large the map is."""
@@ -211,6 +196,7 @@ class MapperNode(ManagedNode):
 
     def status_message(self) -> MapperStatus:
         """The report of this moment, as on ``~/status``."""
+        watch = self._watch
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.input.map_frame)
         return status_message(
             header,
@@ -219,19 +205,9 @@ class MapperNode(ManagedNode):
             self.session,
             self.autosave,
             self.drops.counts(),
-            {} if self._watch is None else self._watch.diagnosis.rates_hz(),
+            {} if watch is None else watch.diagnosis.rates_hz(),
             self.problems(),
         )
-
-    def _resume(self, session: Session) -> None:
-        logger, root = self.get_logger(), self.config.node.map_directory
-        found = read_newest(session, root, logger.warning)
-        if found is None:
-            logger.info(f"no map to resume in '{root}'; starting with an empty one")
-            return
-        name, semantic_map, info = found
-        session.worker.restore(semantic_map, info.stamp_ns, info.camera_poses).result()
-        logger.info(f"resumed map '{name}': {semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances")
 
     def _forget_inputs(self) -> None:
         inputs = self._inputs
@@ -274,9 +250,8 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
     """Run the node until SIGINT or SIGTERM, in a process of its own.
 
     A map that is saved by period is saved a last time then, unless that takes longer than ``node.service_timeout_s`` or
-    there is another signal.
-
-    With ``node.autostart`` it is brought to map at once; otherwise it waits, unconfigured, for a lifecycle manager.
+    there is another signal. With ``node.autostart`` the node begins to map at once; otherwise it waits, unconfigured, for a
+    lifecycle manager.
 
     Args:
         args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
@@ -285,56 +260,7 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
     Returns:
         Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
     """
-    arguments = list(sys.argv[1:] if args is None else args)
-    signals = StopSignals()
-    code = 0
-    node, executor = None, None
-    try:
-        # Without rclpy's handlers, which would pull the context from under callbacks in work.
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        stray = remove_ros_args(arguments)
-        if stray:
-            raise ConfigError(f"unknown arguments: {' '.join(stray)}; ROS arguments follow --ros-args")
-        node = MapperNode(make_pipeline)
-        executor = CallbackExecutor()
-        executor.add_node(node)
-        # Python runs signal handlers in the main thread alone, and not while that waits inside the middleware.
-        spinning = ThreadPoolExecutor(1, "spin").submit(executor.spin_on, node.get_logger().error)
-        if node.config.node.autostart:
-            # While it spins: a manager or an operator can see the state while the models load.
-            node.bring_up()
-        spinning.result()
-    except KeyboardInterrupt:
-        pass
-    except REFUSALS as error:
-        print(f"{NODE_NAME}: {one_line(error)}", file=sys.stderr)
-        code = 1
-    except Exception:
-        traceback.print_exc()
-        code = 1
-    _shut_down(node, executor, signals, code)
-    return code
-
-
-def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int) -> None:
-    """Take everything down within two seconds, but for a last save where that is due."""
-    signals.hold()
-    unfinished = []
-    if executor is not None and not executor.shutdown(_STOP_TIMEOUT_S / 2):
-        unfinished.append("call")
-    if node is not None:
-        if not node.stop(_STOP_TIMEOUT_S):
-            unfinished.append("frame")
-        if not node.save_last(lambda: signals.hurried):
-            unfinished.append("save")
-        node.destroy_node()
-    rclpy.try_shutdown()
-    if unfinished:
-        print(f"{NODE_NAME}: ending in the middle of a {' and a '.join(unfinished)}", file=sys.stderr)
-        # The interpreter's own end would wait for native code that is in work, or crash it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    return run_node(NODE_NAME, lambda: MapperNode(make_pipeline), args)
 
 
 if __name__ == "__main__":

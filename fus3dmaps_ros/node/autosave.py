@@ -12,9 +12,12 @@ from fus3dmaps_core.errors import StorageError
 from fus3dmaps_core.saved_maps.directory import list_maps
 from fus3dmaps_ros.node.map_store import save_session
 from fus3dmaps_ros.node.session import Session
+from fus3dmaps_ros.node.timed_calls import Deadline
 
 NAMES = ("autosave_a", "autosave_b")
 """Names of the maps that are written, in turns: the one before the last is left if the last is damaged."""
+
+_POLL_S = 0.05
 
 
 class Autosave:
@@ -79,6 +82,25 @@ class Autosave:
         if self._thread.ident is not None:
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
+
+    def save_last(self, timeout_s: float, hurried: Callable[[], bool]) -> bool:
+        """Save a last time, if that is due, and end the thread.
+
+        Args:
+            timeout_s: How long to wait, seconds.
+            hurried: Whether not to wait any longer; asked again and again.
+
+        Returns:
+            Whether the thread has ended in time. Otherwise a save is still in work; if the process ends in it, the map that
+            was saved before is left.
+        """
+        if self.is_due:
+            self._logger.info("saving the map; another signal ends at once")
+        deadline = Deadline(timeout_s)
+        while not self.stop(min(_POLL_S, deadline.remaining_s()), save=True):
+            if hurried() or not deadline.remaining_s():
+                return False
+        return True
 
     def save_if_changed(self) -> None:
         """Save now, unless the map is empty or as it was at the last save that succeeded."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fus3dmaps_core.errors import StorageError
 from fus3dmaps_core.offline import map_info
@@ -18,12 +19,12 @@ def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
     """Save the map as it stands; mapping goes on meanwhile.
 
     Args:
-        session: Whose map.
+        session: Has the map.
         root: Directory of saved maps.
         name: The map's name in it.
 
     Returns:
-        Where it is, and its bytes on disk.
+        The map's path, and its size on disk in bytes.
 
     Raises:
         StorageError: The name cannot be one, or the map cannot be written; a map that was there still is.
@@ -46,7 +47,7 @@ def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:
 
 
 def named_map(root: str, name: str) -> Path:
-    """Path of the map of a name, or without a name of the one that was saved last.
+    """Return the path of the map with this name, or without a name of the one that was saved last.
 
     Raises:
         StorageError: There is no such map, or the name cannot be one.
@@ -59,17 +60,24 @@ def named_map(root: str, name: str) -> Path:
     return map_path(root, names[0])
 
 
-def read_newest(session: Session, root: str, warn: Callable[[str], object]) -> tuple[str, SemanticMap, MapInfo] | None:
-    """The newest saved map that is good.
+def resume_newest(session: Session, root: str, logger: Any) -> None:
+    """Go on from the newest good map among the saved ones; without one the session's map stays empty.
 
     Args:
-        session: What it must fit.
+        session: Gets the map, which must fit it.
         root: Directory of saved maps.
-        warn: Is told of each map that is passed over, and why.
-
-    Returns:
-        Its name, the map and what else is known of it; None where there is none.
+        logger: Of the node; is told which map that is, and of each that is passed over, why.
     """
+    found = _read_newest(session, root, logger.warning)
+    if found is None:
+        logger.info(f"no map to resume in '{root}'; starting with an empty one")
+        return
+    name, semantic_map, info = found
+    session.worker.restore(semantic_map, info.stamp_ns, info.camera_poses).result()
+    logger.info(f"resumed map '{name}': {semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances")
+
+
+def _read_newest(session: Session, root: str, warn: Callable[[str], object]) -> tuple[str, SemanticMap, MapInfo] | None:
     try:
         names = list_maps(root)
     except StorageError as error:

@@ -1,0 +1,115 @@
+"""A node in a process of its own, from its arguments to an exit code, whatever signals and errors come."""
+
+from __future__ import annotations
+
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Protocol
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import remove_ros_args
+
+from fus3dmaps_core.errors import ConfigError
+from fus3dmaps_ros.node.executor import CallbackExecutor
+from fus3dmaps_ros.node.refusals import REFUSALS, one_line
+from fus3dmaps_ros.node.signals import StopSignals
+
+_STOP_TIMEOUT_S = 1.0
+
+
+class StoppableNode(Protocol):
+    """A managed node that can be started at once and taken down in two steps."""
+
+    @property
+    def autostart(self) -> bool:
+        """Whether it is brought up at once, without a lifecycle manager."""
+        ...
+
+    def bring_up(self) -> None:
+        """Configure and activate."""
+        ...
+
+    def stop(self, timeout_s: float) -> bool:
+        """End its work; return whether that was done in time."""
+        ...
+
+    def save_last(self, hurried: Callable[[], bool]) -> bool:
+        """Save a last time, after :meth:`stop`, while ``hurried()`` is false; return whether no save is in work."""
+        ...
+
+    def destroy_node(self) -> None:
+        """Give back what ROS holds of it."""
+        ...
+
+    def get_logger(self) -> Any:
+        """Return the node's logger."""
+        ...
+
+
+def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[str] | None = None) -> int:
+    """Run a node until SIGINT or SIGTERM.
+
+    Args:
+        name: Begins each line on stderr.
+        make_node: Makes the node, once ROS is initialised.
+        args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
+
+    Returns:
+        Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
+    """
+    arguments = list(sys.argv[1:] if args is None else args)
+    signals = StopSignals()
+    code = 0
+    node, executor = None, None
+    try:
+        # Without rclpy's handlers, which would pull the context from under callbacks in work.
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+        stray = remove_ros_args(arguments)
+        if stray:
+            raise ConfigError(f"unknown arguments: {' '.join(stray)}; ROS arguments follow --ros-args")
+        node = make_node()
+        executor = CallbackExecutor()
+        executor.add_node(node)
+        # Python runs signal handlers in the main thread alone, and not while that waits inside the middleware.
+        spinning = ThreadPoolExecutor(1, "spin").submit(executor.spin_on, node.get_logger().error)
+        if node.autostart:
+            # While it spins: a manager or an operator can see the state while the models load.
+            node.bring_up()
+        spinning.result()
+    except KeyboardInterrupt:
+        pass
+    except REFUSALS as error:
+        print(f"{name}: {one_line(error)}", file=sys.stderr)
+        code = 1
+    except Exception:
+        traceback.print_exc()
+        code = 1
+    _shut_down(name, node, executor, signals, code)
+    return code
+
+
+def _shut_down(
+    name: str, node: StoppableNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int
+) -> None:
+    """Take everything down within two seconds, but for a last save where that is due."""
+    signals.hold()
+    unfinished = []
+    if executor is not None and not executor.shutdown(_STOP_TIMEOUT_S / 2):
+        unfinished.append("call")
+    if node is not None:
+        if not node.stop(_STOP_TIMEOUT_S):
+            unfinished.append("frame")
+        if not node.save_last(lambda: signals.hurried):
+            unfinished.append("save")
+        node.destroy_node()
+    rclpy.try_shutdown()
+    if unfinished:
+        print(f"{name}: ending in the middle of a {' and a '.join(unfinished)}", file=sys.stderr)
+        # The interpreter's own end would wait for native code that is in work, or crash it.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
