@@ -7,15 +7,44 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.console import Console
 
 from fus3dmaps_core.config.schema import Config, EncoderConfig
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.exporting import ExportedGraph
+from fus3dmaps_ros.commands.settings import ParamsFile, Settings, configuration, directory
+from fus3dmaps_ros.commands.terminal import OUT
+
+if TYPE_CHECKING:
+    from fus3dmaps_core.runtimes.exporting import ExportedGraph
 
 _MIB = 1 << 20
+
+
+def export(
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            parser=directory,
+            metavar="DIRECTORY",
+            help="Directory for graphs and engines; later encoder.graph_directory.",
+        ),
+    ],
+    encoder: Annotated[str | None, typer.Option("--encoder", help="Which encoders; the same as encoder.name.")] = None,
+    precision: Annotated[str | None, typer.Option("--precision", help="fp32, fp16 or bf16; as encoder.precision.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Write the networks of encoders as checked ONNX files, and build TensorRT engines where TensorRT is installed."""
+    chosen = {"encoder.name": encoder, "encoder.precision": precision}
+    config = configuration(params_file, settings).with_values(
+        {key: value for key, value in chosen.items() if value is not None}
+    )
+    export_encoders(config, out, OUT, as_json=as_json)
 
 
 def export_encoders(config: Config, directory: Path, console: Console, *, as_json: bool = False) -> None:

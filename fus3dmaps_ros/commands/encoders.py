@@ -5,18 +5,35 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_core.encoders import registry
-from fus3dmaps_core.encoders.catalogue import Entry, Part, catalogue
+from fus3dmaps_ros.commands.settings import ParamsFile, Settings, configuration
+from fus3dmaps_ros.commands.terminal import OUT
+
+if TYPE_CHECKING:
+    from fus3dmaps_core.encoders.catalogue import Entry, Part
 
 _HEADINGS = ("name", "d", "λ", "patches", "code", "weights", "installed")
+
+
+def encoders(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    weights: Annotated[str | None, typer.Option("--weights", help="Where weights are; the same as encoder.weights.")] = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """List the encoders: their space, their licences, and what of them is installed."""
+    config = configuration(params_file, settings)
+    if weights is not None:
+        config = config.with_values({"encoder.weights": weights})
+    list_encoders(config, OUT, as_json=as_json)
 
 
 def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
@@ -30,6 +47,10 @@ def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
     Raises:
         EncoderError: ``encoder.weights`` names neither a file or directory nor a repository, or ``encoder.name`` no encoder.
     """
+    # Seconds of import, which only those who list them pay.
+    from fus3dmaps_core.encoders import registry
+    from fus3dmaps_core.encoders.catalogue import catalogue
+
     if config.encoder.name not in registry.names():
         registry.card(config.encoder.name)  # Refuses it, with the names that are known.
     entries = catalogue(config.encoder.weights, config.encoder.name)

@@ -9,15 +9,20 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_lab.evaluation.records import CurvePoint, Record
+from fus3dmaps_ros.commands.settings import DatasetOptions, ParamsFile, Settings, configuration, pairs
+from fus3dmaps_ros.commands.terminal import OUT, progress
+
+if TYPE_CHECKING:
+    from fus3dmaps_lab.evaluation.records import CurvePoint, Record
 
 SIMULATION = "simulation"
 _SIMULATED = (
@@ -71,6 +76,23 @@ class Destination:
     json_file: Path | None
     report: Path | None
     console: Console
+
+
+def evaluate(
+    target: Annotated[str, typer.Argument(help="simulation, or a dataset's layout as for convert.")] = "simulation",
+    directory: Annotated[Path | None, typer.Argument(help="The dataset's folder.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many buildings are simulated.")] = 5,
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller buildings, no sweeps.")] = False,
+    jobs: Annotated[int, typer.Option("--jobs", min=0, help="Buildings at once; 0: one for each processor.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write a JSON list of records to this file.")] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Write tables and plots into this directory.")] = None,
+    options: DatasetOptions = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Measure how good maps are: on simulated buildings, or on a labelled dataset."""
+    request = Evaluation(target, directory, seeds, quick, jobs, pairs("--option", options))
+    evaluate_target(request, configuration(params_file, settings), Destination(json_file, report, OUT), progress)
 
 
 def evaluate_target(request: Evaluation, config: Config, destination: Destination, progress: Progress) -> None:
