@@ -24,10 +24,10 @@ from fus3dmaps_ros.node.parameters import declare_parameters, follow_changes, un
 from fus3dmaps_ros.node.process import run_node
 from fus3dmaps_ros.node.session import Session, SessionHolder
 from fus3dmaps_ros.node.worker import FrameWorker
+from fus3dmaps_ros.reporting.health_monitor import HealthMonitor
 from fus3dmaps_ros.reporting.status import StatusPublisher, status_line, status_message
-from fus3dmaps_ros.reporting.watch import Watch
-from fus3dmaps_ros.services.map_services import MapServices
-from fus3dmaps_ros.services.query_services import QueryServices
+from fus3dmaps_ros.services.maps import MapServices
+from fus3dmaps_ros.services.queries import QueryServices
 from fus3dmaps_ros.topics.inputs import Inputs
 from fus3dmaps_ros.topics.outputs import Outputs
 from fus3dmaps_ros.topics.tf_poses import import_tf2_ros
@@ -64,7 +64,7 @@ class MapperNode(ManagedNode):
         self._outputs: Outputs | None = None
         self._offered: list[QueryServices | MapServices] = []
         self._inputs: Inputs | None = None
-        self._watch: Watch | None = None
+        self._monitor: HealthMonitor | None = None
         self.autosave: Autosave | None = None
         self.drops = Drops(DropLog(logger.warning).report)
         self.config = declare_parameters(self)
@@ -131,9 +131,9 @@ class MapperNode(ManagedNode):
             ConfigError: The inputs' parameters cannot be used.
         """
         self._inputs = Inputs(self, self.config, self.worker.offer, self.drops, self._arrived)
-        self._watch = Watch(self, self.config, self._inputs.streams, self._sessions.require())
-        self.worker.observer = self._watch
-        self.drops.tell(self._watch.dropped)
+        self._monitor = HealthMonitor(self, self.config, self._inputs.streams, self._sessions.require())
+        self.worker.observer = self._monitor
+        self.drops.tell(self._monitor.dropped)
         self.get_logger().info("ready")
 
     def deactivate(self) -> None:
@@ -145,10 +145,10 @@ class MapperNode(ManagedNode):
         if session is not None:
             session.worker.drop_waiting()
             session.worker.observer = None
-        watch, self._watch = self._watch, None
-        if watch is not None:
-            self.drops.stop_telling(watch.dropped)
-            watch.close()
+        monitor, self._monitor = self._monitor, None
+        if monitor is not None:
+            self.drops.stop_telling(monitor.dropped)
+            monitor.close()
 
     def cleanup(self) -> None:
         """Free the map and the models; a map that is saved by period is saved a last time."""
@@ -196,7 +196,7 @@ class MapperNode(ManagedNode):
 
     def status_message(self) -> MapperStatus:
         """The report of this moment, as on ``~/status``."""
-        watch = self._watch
+        monitor = self._monitor
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.input.map_frame)
         return status_message(
             header,
@@ -205,7 +205,7 @@ class MapperNode(ManagedNode):
             self.session,
             self.autosave,
             self.drops.counts(),
-            {} if watch is None else watch.diagnosis.rates_hz(),
+            {} if monitor is None else monitor.diagnosis.rates_hz(),
             self.problems(),
         )
 
@@ -216,20 +216,20 @@ class MapperNode(ManagedNode):
 
     def problems(self) -> list[str]:
         """What is wrong, in words; nothing unless the node is active."""
-        watch = self._watch
-        return [problem.sentence for problem in watch.problems()] if watch is not None else []
+        monitor = self._monitor
+        return [problem.sentence for problem in monitor.problems()] if monitor is not None else []
 
     def _arrived(self, topic: str, stamp_ns: int) -> None:
-        watch = self._watch
-        if watch is not None:  # It comes a moment after the inputs that it watches.
-            watch.arrived(topic, stamp_ns)
+        monitor = self._monitor
+        if monitor is not None:  # It comes a moment after the inputs that it watches.
+            monitor.arrived(topic, stamp_ns)
 
     def _log_line(self) -> tuple[str, dict[str, str]]:
         """How it fares, and the problems by kind, for the log."""
         if self.session is None:
             return self.state, {}
-        watch = self._watch
-        return self.status(), {each.kind: each.sentence for each in (watch.problems() if watch is not None else [])}
+        monitor = self._monitor
+        return self.status(), {each.kind: each.sentence for each in (monitor.problems() if monitor is not None else [])}
 
     def _read_config(self) -> Config:
         return self.config

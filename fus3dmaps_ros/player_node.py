@@ -17,7 +17,6 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
@@ -26,6 +25,7 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.storage import RawMessage
 from fus3dmaps_ros.node.refusals import REFUSALS
+from fus3dmaps_ros.topics.qos import named_qos
 from fus3dmaps_ros.topics.transport import enlarge_shared_memory
 
 NODE_NAME = "fus3dmaps_player"
@@ -53,14 +53,14 @@ class Player(Node):
         """
         super().__init__(NODE_NAME, **options)
         self._recording = recording
-        self._clock_outlet = self.create_publisher(Clock, "/clock", _qos(depth=10))
+        self._clock_outlet = self.create_publisher(Clock, "/clock", named_qos("reliable", 10))
         self._outlets: dict[str, Publisher] = {}
         for topic, summary in recording.topics.items():
             message_type = _message_type(summary.msgtype)
             if message_type is None:
                 self.get_logger().warning(f"{topic} is not played: message type {summary.msgtype} is not installed")
             elif topic != "/clock":
-                self._outlets[topic] = self.create_publisher(message_type, topic, _qos(depth=20))
+                self._outlets[topic] = self.create_publisher(message_type, topic, named_qos("reliable", 20))
         if not self._outlets:
             raise RecordingError(f"recording '{recording.path}' has no topic of an installed message type")
 
@@ -187,15 +187,6 @@ def main(args: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if args is None else args)
     options = parser.parse_args(remove_ros_args(arguments))
     return play(options.bag, rate=options.rate, wait_for_subscribers_s=options.wait, ros_arguments=arguments)
-
-
-def _qos(depth: int) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
 
 
 def _message_type(name: str) -> Any:

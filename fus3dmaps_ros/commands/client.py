@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import Image, PointCloud2
 
 from fus3dmaps_core.answers.query import RankedInstance
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.messages.fields import stamp_ns, to_pose
 from fus3dmaps_msgs.srv import LoadMap, QueryImage, QueryText, SaveMap
-from fus3dmaps_ros.topics.conversions import from_cloud, unpack_rgb
-
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+from fus3dmaps_ros.topics.conversions import cloud_points, from_cloud, from_instance, unpack_rgb
+from fus3dmaps_ros.topics.qos import LATCHED
 
 
 class MapperClient:
@@ -143,7 +141,7 @@ class MapperClient:
             QueryError: None is published in time.
         """
         table = from_cloud(self._receive(PointCloud2, "map", since_ns, timeout_s))
-        return np.stack([table[axis] for axis in "xyz"], axis=1), unpack_rgb(table["rgb"])
+        return cloud_points(table), unpack_rgb(table["rgb"])
 
     def camera_poses(self, since_ns: int = 0, timeout_s: float = 30.0) -> NDArray[np.float64]:
         """Poses T_world_camera (n, 4, 4) of the node's keyframes.
@@ -161,7 +159,7 @@ class MapperClient:
     def _receive(self, message_type: Any, topic: str, since_ns: int, timeout_s: float) -> Any:
         """A message of one of the node's latched topics."""
         received: list[Any] = []
-        subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, _LATCHED)
+        subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, LATCHED)
         deadline = time.monotonic() + timeout_s
         try:
             while time.monotonic() < deadline:
@@ -186,23 +184,7 @@ def _options(negative_prompts: Sequence[str], layer: str, threshold: float, top_
 
 def ranked_instances(response: QueryText.Response | QueryImage.Response) -> list[RankedInstance]:
     """The instances of a reply, best first."""
-    return [
-        RankedInstance(
-            id=found.id,
-            prompt=found.prompt,
-            score=found.score,
-            weight=found.weight,
-            centroid_m=_position(found.centroid),
-            box_min_m=_position(found.box_min),
-            box_max_m=_position(found.box_max),
-            voxels=found.voxels,
-        )
-        for found in response.instances
-    ]
-
-
-def _position(point: Any) -> NDArray[np.float32]:
-    return np.array([point.x, point.y, point.z], np.float32)
+    return [from_instance(found) for found in response.instances]
 
 
 def similarity_points(
@@ -210,4 +192,4 @@ def similarity_points(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
     table = from_cloud(response.similarity)
-    return np.stack([table[axis] for axis in "xyz"], axis=1), np.array(table["similarity"])
+    return cloud_points(table), np.array(table["similarity"])

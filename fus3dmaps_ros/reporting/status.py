@@ -9,7 +9,6 @@ import torch
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
@@ -18,13 +17,8 @@ from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
 from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.node.timers import change_period
+from fus3dmaps_ros.topics.qos import LATCHED
 
-_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 _LOG_PERIOD_S = 5.0
 
 
@@ -127,7 +121,7 @@ class StatusPublisher:
         self._report = report
         self._line = line
         self._told, self._known = "", frozenset[str]()
-        self._publisher = node.create_publisher(MapperStatus, "~/status", _QOS)
+        self._publisher = node.create_publisher(MapperStatus, "~/status", LATCHED)
         group, clock = MutuallyExclusiveCallbackGroup(), Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(read().node.status_period_s, self._publish, callback_group=group, clock=clock)
         self._line_timer = node.create_timer(_LOG_PERIOD_S, self._say, callback_group=group, clock=clock)

@@ -8,22 +8,13 @@ from typing import Any, TypeVar
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import Fus3dmapsError
 from fus3dmaps_ros.node.timed_calls import Deadline, TimedCalls
+from fus3dmaps_ros.topics.qos import SERVICE_QOS
 
 T = TypeVar("T")
-
-SERVICE_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
-"""The default keeps ten requests: of a hundred that come at once, ninety would wait for ever. Who sends many at once from
-one client needs it there, too, for requests that wait to be taken and replies."""
 
 
 class Call:

@@ -94,6 +94,11 @@ def from_cloud(message: PointCloud2) -> NDArray[Any]:
     return np.frombuffer(message.data, dtype=layout, count=message.width * message.height)
 
 
+def cloud_points(table: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the positions (n, 3), metres, of the points that :func:`from_cloud` has read."""
+    return np.stack([table[axis] for axis in "xyz"], axis=1)
+
+
 def pack_rgb(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Colours (n, 3) as the packed float32 ``rgb`` field that PCL and RViz read."""
     wide = colors.astype(np.uint32)
@@ -155,6 +160,20 @@ def to_instance(header: Header, found: RankedInstance) -> SemanticInstance:
     )
 
 
+def from_instance(message: SemanticInstance) -> RankedInstance:
+    """Read a ranked instance from a message; the inverse of :func:`to_instance`."""
+    return RankedInstance(
+        id=message.id,
+        prompt=message.prompt,
+        score=message.score,
+        weight=message.weight,
+        centroid_m=from_point(message.centroid).astype(np.float32),
+        box_min_m=from_point(message.box_min).astype(np.float32),
+        box_max_m=from_point(message.box_max).astype(np.float32),
+        voxels=message.voxels,
+    )
+
+
 def to_instances(header: Header, instances: InstanceSnapshot, min_voxels: int) -> list[SemanticInstance]:
     """The instances that occupy at least ``min_voxels`` voxels, and at least one, by ascending id; without a prompt."""
     return [
@@ -175,6 +194,11 @@ def to_point(position_m: NDArray[np.floating] | Sequence[float]) -> Point:
     """A point message of three metres."""
     x, y, z = (float(value) for value in position_m)
     return Point(x=x, y=y, z=z)
+
+
+def from_point(point: Point) -> NDArray[np.float64]:
+    """Read a point message as (3,) metres."""
+    return np.array([point.x, point.y, point.z])
 
 
 def to_path(header: Header, poses: NDArray[np.float64]) -> Path:
@@ -204,7 +228,7 @@ def to_answer_markers(header: Header, found: Sequence[SemanticInstance]) -> Mark
     """A translucent box for every instance of an answer, and over it the prompt and the score; without any, a clearing."""
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     for number, instance in enumerate(found):
-        low, high = (np.array([corner.x, corner.y, corner.z]) for corner in (instance.box_min, instance.box_max))
+        low, high = from_point(instance.box_min), from_point(instance.box_max)
         text = f"{instance.prompt} {instance.score:.2f}"
         markers += _labelled_box(header, number, low, high, text, instance_color(instance.id, alpha=0.4))
     return MarkerArray(markers=markers)

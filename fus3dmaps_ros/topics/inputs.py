@@ -11,15 +11,14 @@ from nav_msgs.msg import Odometry
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fus3dmaps_core.config.input import QosProfile
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages.fields import stamp_ns
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
 from fus3dmaps_core.sources.streams import InputStream, uses_tf
+from fus3dmaps_ros.topics.qos import named_qos
 from fus3dmaps_ros.topics.tf_poses import TfListener
 
 _TYPES: dict[str, type[Any]] = {
@@ -30,15 +29,10 @@ _TYPES: dict[str, type[Any]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
     "nav_msgs/msg/Odometry": Odometry,
 }
-_POLICIES: dict[QosProfile, tuple[ReliabilityPolicy, DurabilityPolicy]] = {
-    "sensor_data": (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
-    "reliable": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
-    "transient_local": (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
-    "best_available": (ReliabilityPolicy.BEST_AVAILABLE, DurabilityPolicy.BEST_AVAILABLE),
-}
 # Deep enough to ride out a pause of the interpreter of a third of a second at 30 Hz; the profile's usual 5 are not.
 _IMAGE_DEPTH = 10
 _POSE_DEPTH = 200
+_POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
 _TF_PERIOD_S = 0.02  # How soon after a transform the image that waits for it goes on.
 
 
@@ -83,7 +77,7 @@ class Inputs:
                 _TYPES[stream.msgtype],
                 stream.topic,
                 self._callback(stream),
-                input_qos(stream.qos, _POSE_DEPTH if stream.parameter in _POSE_PARAMETERS else _IMAGE_DEPTH),
+                named_qos(stream.qos, _POSE_DEPTH if stream.parameter in _POSE_PARAMETERS else _IMAGE_DEPTH),
                 callback_group=group,
             )
             for stream in self.streams
@@ -130,17 +124,3 @@ class Inputs:
         self._pairer.hand_over_drops(self._drops)
         for paired in ready:
             self._take(paired)
-
-
-_POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
-
-
-def input_qos(profile: QosProfile, depth: int) -> QoSProfile:
-    """The QoS of an input by profile name.
-
-    ``sensor_data`` is best effort and volatile, and matches any publisher; ``reliable`` is volatile, too;
-    ``transient_local`` is reliable and gets what a latched publisher said before; ``best_available`` is the most
-    that all publishers give that are there when it subscribes, and with none there as ``transient_local``.
-    """
-    reliability, durability = _POLICIES[profile]
-    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability, durability=durability)

@@ -10,7 +10,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -21,14 +20,7 @@ from fus3dmaps_ros.node.session import SessionHolder
 from fus3dmaps_ros.node.timers import change_period
 from fus3dmaps_ros.topics import conversions
 from fus3dmaps_ros.topics.detections import to_detections, vision_messages
-
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-"""QoS of everything published: late subscribers get the last message."""
+from fus3dmaps_ros.topics.qos import LATCHED
 
 _LOG_PERIOD_S = 5.0
 

@@ -31,7 +31,7 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.saved_maps.directory import map_path
 from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText, SaveMap
-from fus3dmaps_ros.services.serving import SERVICE_QOS
+from fus3dmaps_ros.topics.qos import SERVICE_QOS
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS

@@ -26,7 +26,7 @@ from fus3dmaps_msgs.srv import Fuse, LoadMap, QueryText, SaveMap
 from fus3dmaps_ros.commands import cli
 from fus3dmaps_ros.player_node import play
 from fus3dmaps_ros.topics.conversions import from_cloud
-from fus3dmaps_ros.topics.outputs import LATCHED
+from fus3dmaps_ros.topics.qos import LATCHED
 
 NODE = Path(__file__).with_name("random_weights_node.py")
 FRAMES = 2  # Of the recording, as conftest.py writes it.

@@ -17,7 +17,7 @@ from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.streams import InputStream, pose_topic
 from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.reporting.diagnostics import Diagnostics, publishers_of
-from fus3dmaps_ros.topics.inputs import input_qos
+from fus3dmaps_ros.topics.qos import named_qos
 
 _ROLES: dict[str, Literal["rgb", "depth", "camera_info"]] = {
     "input.rgb_topic": "rgb",
@@ -27,7 +27,7 @@ _ROLES: dict[str, Literal["rgb", "depth", "camera_info"]] = {
 }
 
 
-class Watch:
+class HealthMonitor:
     """From activation to deactivation: follows inputs and frames, and publishes ``/diagnostics``."""
 
     def __init__(self, node: Node, config: Config, streams: Sequence[InputStream], session: Session) -> None:
@@ -115,7 +115,7 @@ class Watch:
 
 
 def _stream(stream: InputStream) -> Stream:
-    qos = input_qos(stream.qos, 1)
+    qos = named_qos(stream.qos, 1)
     role: Literal["rgb", "depth", "camera_info", "pose"] = _ROLES.get(stream.parameter, "pose")
     return Stream(
         stream.topic,
