@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from fus3dmaps_core.answers.query import RankedInstance
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.messages.fields import stamp_ns, to_pose
-from fus3dmaps_msgs.srv import LoadMap, QueryImage, QueryText, SaveMap
+from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.topics.conversions import cloud_points, from_cloud, from_instance, unpack_rgb
 from fus3dmaps_ros.topics.qos import LATCHED
 
@@ -72,58 +72,18 @@ class MapperClient:
         Raises:
             QueryError: The node refuses, with its own words, or does not answer in time.
         """
-        request = QueryText.Request(prompts=list(prompts), **_options(negative_prompts, layer, threshold, top_k, publish))
-        return self._call(self._query, request, timeout_s)
-
-    def ask_image(
-        self,
-        image: Image,
-        *,
-        negative_prompts: Sequence[str] = (),
-        layer: str = "",
-        threshold: float = 0.0,
-        top_k: int = 0,
-        publish: bool = False,
-        timeout_s: float = 60.0,
-    ) -> QueryImage.Response:
-        """Ask for the thing that fills an image.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        request = QueryImage.Request(image=image, **_options(negative_prompts, layer, threshold, top_k, publish))
-        return self._call_once(QueryImage, "query_image", request, timeout_s)
-
-    def save_map(self, name: str, timeout_s: float = 60.0) -> SaveMap.Response:
-        """Have the node save its map under a name.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        return self._call_once(SaveMap, "save_map", SaveMap.Request(name=name), timeout_s)
-
-    def load_map(self, name: str = "", timeout_s: float = 60.0) -> LoadMap.Response:
-        """Have the node go on from a saved map; without a name from the newest.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        return self._call_once(LoadMap, "load_map", LoadMap.Request(name=name), timeout_s)
-
-    def _call_once(self, service_type: Any, name: str, request: Any, timeout_s: float) -> Any:
-        client = self._node.create_client(service_type, f"{self._name}/{name}")
-        try:
-            if not client.wait_for_service(timeout_sec=timeout_s):
-                raise QueryError(f"no node '{self._name}' answers on {self._name}/{name} within {timeout_s:.0f} s")
-            return self._call(client, request, timeout_s)
-        finally:
-            self._node.destroy_client(client)
-
-    def _call(self, client: Any, request: Any, timeout_s: float) -> Any:
-        future = client.call_async(request)
+        request = QueryText.Request(
+            prompts=list(prompts),
+            negative_prompts=list(negative_prompts),
+            layer=layer,
+            threshold=threshold,
+            top_k=top_k,
+            publish=publish,
+        )
+        future = self._query.call_async(request)
         self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
         if not future.done():
-            client.remove_pending_request(future)
+            self._query.remove_pending_request(future)
             raise QueryError(f"node '{self._name}' did not answer within {timeout_s:.0f} s")
         response = future.result()
         if not response.success:
@@ -171,24 +131,13 @@ class MapperClient:
         raise QueryError(f"nothing new is published on {self._name}/{topic} within {timeout_s:.0f} s")
 
 
-def _options(negative_prompts: Sequence[str], layer: str, threshold: float, top_k: int, publish: bool) -> dict[str, Any]:
-    """The fields that questions by text and by image share."""
-    return {
-        "negative_prompts": list(negative_prompts),
-        "layer": layer,
-        "threshold": threshold,
-        "top_k": top_k,
-        "publish": publish,
-    }
-
-
-def ranked_instances(response: QueryText.Response | QueryImage.Response) -> list[RankedInstance]:
+def ranked_instances(response: QueryText.Response) -> list[RankedInstance]:
     """The instances of a reply, best first."""
     return [from_instance(found) for found in response.instances]
 
 
 def similarity_points(
-    response: QueryText.Response | QueryImage.Response,
+    response: QueryText.Response,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
     table = from_cloud(response.similarity)

@@ -59,11 +59,6 @@ class ManagedNode(LifecycleNodeMixin, Node):
         for trigger in (self.trigger_configure, self.trigger_activate):
             self._attempt(trigger)
 
-    def finalize(self) -> None:
-        """Go to the final state from any primary one; does nothing if it is reached already."""
-        if self.state in (UNCONFIGURED, INACTIVE, ACTIVE):
-            self._attempt(self.trigger_shutdown)
-
     def configure(self) -> None:
         """Make ready, from unconfigured to inactive; what was made before a failure is taken back by :meth:`cleanup`."""
         raise NotImplementedError

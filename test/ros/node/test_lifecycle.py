@@ -262,8 +262,7 @@ def test_finalizing_gives_everything_back_once(fragile) -> None:
     node = fragile()
     node.bring_up()
     assert node.state == "active"
-    node.finalize()
-    node.finalize()
+    node.trigger_shutdown()
     assert (node.done, node.state) == (["configure", "activate", "deactivate", "cleanup"], "finalized")
 
 
