@@ -1,4 +1,4 @@
-"""What a run counts, live and offline alike: frames, keyframes, drops by reason, and how long each stage takes."""
+"""The counts of a run, live and offline alike: frames, keyframes, drops by reason, and the time of each stage."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Drops:
         """Start at zero.
 
         Args:
-            observers: Called at once, in the caller's thread, for whatever is added.
+            observers: Called at once for all drops, in the thread that adds them.
         """
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
@@ -61,12 +61,12 @@ class Drops:
             other.add(reason, latest[reason], number)
 
     def tell(self, observer: DropObserver) -> None:
-        """Call an observer for whatever is added from now on."""
+        """Call an observer for all drops from now on."""
         with self._lock:
             self._observers = (*self._observers, observer)
 
     def stop_telling(self, observer: DropObserver) -> None:
-        """Call an observer no longer; does nothing if it is not called."""
+        """Call an observer no longer; do nothing if it is not called."""
         with self._lock:
             self._observers = tuple(each for each in self._observers if each != observer)
 

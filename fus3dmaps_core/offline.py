@@ -1,4 +1,4 @@
-"""Mapping a whole recording in process: the live node's steps, fed from a file and never dropping for lack of time."""
+"""Mapping of a whole recording in process, with the live node's steps; no frame is dropped for lack of time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def map_recording(path: Path, pipeline: Pipeline, on_progress: Callable[[int, in
 
     Args:
         path: rosbag2 directory or MCAP file.
-        pipeline: Where the frames go.
+        pipeline: Maps the frames.
         on_progress: Called with the number of frames done and expected.
 
     Raises:

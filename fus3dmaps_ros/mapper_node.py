@@ -38,21 +38,21 @@ NODE_NAME = "fus3dmaps"
 class MapperNode(ManagedNode):
     """Maps what the camera sees and answers questions about it.
 
-    Unconfigured it has neither models nor a map; inactive it has both and answers, but takes no images; active it maps. Its
-    topics and services appear when it is configured for the first time.
+    While unconfigured it has neither models nor a map. While inactive it has both and answers, but takes no images. While
+    active it maps. Its topics and services appear when it is configured for the first time.
 
     Attributes:
         config: The configuration in force.
-        drops: Counts messages and frames that were dropped.
-        autosave: Saves the map by period; None while unconfigured.
+        drops: Counts of messages and frames that were dropped.
+        autosave: Saves the map periodically; None while unconfigured.
     """
 
     def __init__(self, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config, **options: Any) -> None:
-        """Read the parameters; nothing is loaded yet.
+        """Read the parameters, without loading anything.
 
         Args:
-            make_pipeline: Builds the pipeline from the configuration; loads the models.
-            options: For ``rclpy.node.Node``, e.g. ``context``, ``namespace`` or ``parameter_overrides``.
+            make_pipeline: Builds the pipeline from the configuration and loads the models.
+            options: Options of ``rclpy.node.Node``, e.g. ``context``, ``namespace`` or ``parameter_overrides``.
 
         Raises:
             ConfigError: A parameter is wrong; the message names it.
@@ -75,7 +75,7 @@ class MapperNode(ManagedNode):
 
     @property
     def autostart(self) -> bool:
-        """Whether it maps at once, without a lifecycle manager."""
+        """Whether the node starts to map by itself, without a lifecycle manager."""
         return self.config.node.autostart
 
     @property
@@ -94,15 +94,15 @@ class MapperNode(ManagedNode):
         return self._sessions.require().worker
 
     def configure(self) -> None:
-        """Load and warm up the models, resume a saved map where that is wanted, and offer topics and services.
+        """Load and warm up the models, resume a saved map if configured, and offer topics and services.
 
         Raises:
-            ConfigError: TF is wanted and not installed.
+            ConfigError: TF is needed and not installed.
             EncoderError: A model cannot be loaded.
         """
         logger, config = self.get_logger(), self.config
         if uses_tf(config.input):
-            import_tf2_ros()  # Before the models are loaded for nothing.
+            import_tf2_ros()  # Refuses before models are loaded in vain.
         logger.info(f"loading encoder '{config.encoder.name}' and segmenter '{config.segmenter.name}'")
         started = time.monotonic()
         pipeline = self._make_pipeline(config)
@@ -111,13 +111,13 @@ class MapperNode(ManagedNode):
         session.worker.start()
         self._sessions.replace(session)
         if self.config is not config:
-            self._apply_config(self.config)  # Set while the models were loaded.
+            self._apply_config(self.config)  # It changed while the models were loaded.
         if config.node.resume:
             resume_newest(session, config.node.map_directory, logger)
         self.autosave = Autosave(session, self._read_config, logger)
         self.autosave.start()
         if self._outputs is None:
-            # Once: a service or publisher that is destroyed while a callback uses it would take the executor with it.
+            # Only once: destroying a service or publisher that a callback is using would end the executor.
             self._outputs = Outputs(self, self._sessions, self._read_config)
             self._offered = [
                 QueryServices(self, self._sessions, self._outputs, self._read_config),
@@ -125,10 +125,10 @@ class MapperNode(ManagedNode):
             ]
 
     def activate(self) -> None:
-        """Subscribe to the inputs and map.
+        """Subscribe to the inputs and start mapping.
 
         Raises:
-            ConfigError: The inputs' parameters cannot be used.
+            ConfigError: The parameters of the inputs cannot be used.
         """
         self._inputs = Inputs(self, self.config, self.worker.offer, self.drops, self._arrived)
         self._monitor = HealthMonitor(self, self.config, self._inputs.streams, self._sessions.require())
@@ -137,7 +137,7 @@ class MapperNode(ManagedNode):
         self.get_logger().info("ready")
 
     def deactivate(self) -> None:
-        """Unsubscribe; what waits to be mapped is dropped, the map stays."""
+        """Unsubscribe and drop the frames that wait; the map stays."""
         inputs, self._inputs = self._inputs, None
         if inputs is not None:
             inputs.close()
@@ -151,7 +151,7 @@ class MapperNode(ManagedNode):
             monitor.close()
 
     def cleanup(self) -> None:
-        """Free the map and the models; a map that is saved by period is saved a last time."""
+        """Free the map and the models, after a last save if the map is saved periodically."""
         self._end_session()
         if self._outputs is not None:
             self._outputs.clear_answers()
@@ -169,33 +169,33 @@ class MapperNode(ManagedNode):
         self._sessions.replace(None)
 
     def stop(self, timeout_s: float) -> bool:
-        """Unsubscribe and end the mapping thread, whatever the state; whether it ended in time.
+        """Unsubscribe and end the mapping thread, in any state; the map stays, and :meth:`save_last` can still save it.
 
-        The map stays, and can still be saved by :meth:`save_last`.
+        Returns:
+            Whether the thread ended in time.
         """
         self.deactivate()
         session = self.session
         return session is None or session.worker.stop(timeout_s)
 
     def save_last(self, hurried: Callable[[], bool]) -> bool:
-        """Save a map that is saved by period a last time, if it has changed, after :meth:`stop`.
+        """Save the map a last time after :meth:`stop`, if it is saved periodically and has changed.
 
         Args:
-            hurried: Whether not to wait any longer; asked again and again.
+            hurried: Called repeatedly; returns whether to stop waiting.
 
         Returns:
-            Whether no save is in work any more. One that was hurried or takes longer than ``node.service_timeout_s`` is; if
-            the process ends in it, the map that was saved before is left.
+            Whether no save is in progress: see :meth:`Autosave.save_last`, which may take ``node.service_timeout_s``.
         """
         autosave = self.autosave
         return autosave is None or autosave.save_last(self.config.node.service_timeout_s, hurried)
 
     def status(self) -> str:
-        """One line on what came in, what was mapped, what was dropped and how large the map is."""
+        """Describe in one line what came in, what was mapped, what was dropped and how large the map is."""
         return status_line(self.session, self.drops.counts())
 
     def status_message(self) -> MapperStatus:
-        """The report of this moment, as on ``~/status``."""
+        """Make the message that ``~/status`` publishes now."""
         monitor = self._monitor
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.input.map_frame)
         return status_message(
@@ -215,17 +215,17 @@ class MapperNode(ManagedNode):
             inputs.reset()
 
     def problems(self) -> list[str]:
-        """What is wrong, in words; nothing unless the node is active."""
+        """Return sentences that say what is wrong; none unless the node is active."""
         monitor = self._monitor
         return [problem.sentence for problem in monitor.problems()] if monitor is not None else []
 
     def _arrived(self, topic: str, stamp_ns: int) -> None:
         monitor = self._monitor
-        if monitor is not None:  # It comes a moment after the inputs that it watches.
+        if monitor is not None:  # It is made shortly after the inputs that it monitors.
             monitor.arrived(topic, stamp_ns)
 
     def _log_line(self) -> tuple[str, dict[str, str]]:
-        """How it fares, and the problems by kind, for the log."""
+        """Return a line for the log on the state of mapping, and the problems by kind."""
         if self.session is None:
             return self.state, {}
         monitor = self._monitor
@@ -247,15 +247,15 @@ class MapperNode(ManagedNode):
 
 
 def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config) -> int:
-    """Run the node until SIGINT or SIGTERM, in a process of its own.
+    """Run the node in this process until SIGINT or SIGTERM.
 
-    A map that is saved by period is saved a last time then, unless that takes longer than ``node.service_timeout_s`` or
-    there is another signal. With ``node.autostart`` the node begins to map at once; otherwise it waits, unconfigured, for a
+    A map that is saved periodically is then saved a last time, unless that takes longer than ``node.service_timeout_s`` or
+    another signal comes. With ``node.autostart`` the node starts to map by itself; otherwise it waits, unconfigured, for a
     lifecycle manager.
 
     Args:
-        args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
-        make_pipeline: As for :class:`MapperNode`.
+        args: Arguments without the program's name, ``--ros-args ...``; by default those of the process.
+        make_pipeline: See :class:`MapperNode`.
 
     Returns:
         Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.

@@ -1,4 +1,4 @@
-"""Starts the mapper node, and RViz or the Foxglove bridge where asked: ros2 launch fus3dmaps_ros fus3dmaps.launch.py -s."""
+"""Launch file of the mapper node, with RViz or the Foxglove bridge: ros2 launch fus3dmaps_ros fus3dmaps.launch.py -s."""
 # ruff: noqa: I001  (this folder's name makes the package `launch` look like one of ours)
 
 from pathlib import Path
@@ -29,7 +29,7 @@ SHOWN = ("map", "labels", "similarity", "instances", "answer", "detections", "pa
 
 
 def generate_launch_description():
-    """Declare the arguments; the nodes follow from their values."""
+    """Declare the arguments, whose values decide on the nodes."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -72,7 +72,7 @@ def generate_launch_description():
 
 
 def nodes(context):
-    """The nodes for the values that the arguments have."""
+    """Return the nodes for the values of the arguments."""
     given = context.launch_configurations
     config = Path(get_package_share_directory("fus3dmaps_ros")) / "config"
     clock = {"use_sim_time": is_true(given["use_sim_time"])}
@@ -107,7 +107,7 @@ def nodes(context):
 
 
 def parameter_files(given, config):
-    """The node's parameter files, of which the later ones win: defaults, the camera's preset, the user's own."""
+    """Return the node's parameter files, of which later ones win: defaults, the camera's preset, the user's own."""
     files = [str(config / "fus3dmaps.yaml")]
     if given["camera"] != "none":
         files.append(str(config / "presets" / f"{given['camera']}.yaml"))
@@ -117,7 +117,7 @@ def parameter_files(given, config):
 
 
 def overrides(given):
-    """Parameters that the arguments set by themselves."""
+    """Return the parameters that single arguments set."""
     values = {
         # Text stays text: a topic or a device must not be read as a number.
         parameter: ParameterValue(given[argument], value_type=str)
@@ -133,5 +133,5 @@ def overrides(given):
 
 
 def is_true(text):
-    """Whether an argument says true."""
+    """Return whether an argument says true."""
     return text.lower() == "true"

@@ -242,11 +242,11 @@ class Config(Section):
             raise ConfigError(f"{path}: {error}") from None
 
     def flat(self) -> dict[str, Any]:
-        """Every value under its dotted key, in the order of the schema."""
+        """Return every value under its dotted key, in the order of the schema."""
         return dict(_flatten(self.model_dump()))
 
     def with_values(self, values: Mapping[str, Any]) -> Config:
-        """A copy in which the given dotted keys are replaced.
+        """Return a copy in which the values of the given dotted keys are replaced.
 
         Raises:
             ConfigError: As :meth:`from_flat`.
@@ -270,7 +270,7 @@ def _describe(error: ValidationError) -> str:
 
 
 def fields() -> dict[str, FieldInfo]:
-    """The schema's fields (default, description, bounds) under their dotted keys, in order."""
+    """Return the schema's fields (default, description, bounds) under their dotted keys, in order."""
     return dict(_FIELDS)
 
 

@@ -1,4 +1,4 @@
-"""The ``fus3dmaps`` command. Each sub-command imports what it needs when it runs, so that help comes at once."""
+"""The ``fus3dmaps`` command. Each sub-command imports what it needs when it runs, so that help appears at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A client of the mapper node: asks it in words and collects what a picture of the answer needs."""
+"""A client of the mapper node: asks questions and collects what a picture of the answer needs."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class MapperClient:
     """Talks to one mapper node, in a ROS context of its own. Use it as a context manager."""
 
     def __init__(self, node_name: str = "/fus3dmaps") -> None:
-        """Connect to the node of this fully qualified name."""
+        """Connect to the node with this fully qualified name."""
         self._name = node_name
         self._context = Context()
         rclpy.init(context=self._context)
@@ -67,7 +67,7 @@ class MapperClient:
         publish: bool = False,
         timeout_s: float = 60.0,
     ) -> QueryText.Response:
-        """Ask for prompts.
+        """Ask where the things are that prompts name.
 
         Raises:
             QueryError: The node refuses, with its own words, or does not answer in time.
@@ -91,10 +91,10 @@ class MapperClient:
         return response
 
     def map_cloud(self, since_ns: int = 0, timeout_s: float = 30.0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """The node's map: voxel centres (n, 3) in metres and their colours (n, 3).
+        """Return the node's map: voxel centres (n, 3) in metres and their colours (n, 3).
 
         Args:
-            since_ns: Oldest stamp that will do; the node first hands out the last map that anyone listened to.
+            since_ns: Oldest stamp that is accepted; the node first sends the map that it published last.
             timeout_s: Longest wait.
 
         Raises:
@@ -104,10 +104,10 @@ class MapperClient:
         return cloud_points(table), unpack_rgb(table["rgb"])
 
     def camera_poses(self, since_ns: int = 0, timeout_s: float = 30.0) -> NDArray[np.float64]:
-        """Poses T_world_camera (n, 4, 4) of the node's keyframes.
+        """Return the poses T_world_camera (n, 4, 4) of the node's keyframes.
 
         Args:
-            since_ns: Oldest stamp that will do.
+            since_ns: Oldest stamp that is accepted.
             timeout_s: Longest wait.
 
         Raises:
@@ -117,7 +117,7 @@ class MapperClient:
         return np.array([to_pose(pose, "path") for pose in message.poses]).reshape(-1, 4, 4)
 
     def _receive(self, message_type: Any, topic: str, since_ns: int, timeout_s: float) -> Any:
-        """A message of one of the node's latched topics."""
+        """Receive a message of one of the node's latched topics."""
         received: list[Any] = []
         subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, LATCHED)
         deadline = time.monotonic() + timeout_s
@@ -132,13 +132,13 @@ class MapperClient:
 
 
 def ranked_instances(response: QueryText.Response) -> list[RankedInstance]:
-    """The instances of a reply, best first."""
+    """Return the instances of a reply, best first."""
     return [from_instance(found) for found in response.instances]
 
 
 def similarity_points(
     response: QueryText.Response,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
+    """Return the similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
     table = from_cloud(response.similarity)
     return cloud_points(table), np.array(table["similarity"])

@@ -1,4 +1,4 @@
-"""``fus3dmaps encoders``: which encoders there are, under which licences, and what of them is installed. Needs no ROS."""
+"""``fus3dmaps encoders``: a list of all encoders, their licences, and which of their parts are installed. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
     """Print every encoder trio.
 
     Args:
-        config: Says where weights are, and the size of the images that the patch grid is for.
-        console: Where the table goes; JSON goes to standard output as it is.
-        as_json: Print a JSON list in place of the table.
+        config: Says where weights are, and for which image size patch grids are listed.
+        console: Gets the table; JSON goes directly to standard output.
+        as_json: Print a JSON list instead of the table.
 
     Raises:
         EncoderError: ``encoder.weights`` names neither a file or directory nor a repository, or ``encoder.name`` no encoder.
     """
-    # Seconds of import, which only those who list them pay.
+    # These take seconds to import.
     from fus3dmaps_core.encoders import registry
     from fus3dmaps_core.encoders.catalogue import catalogue
 
@@ -64,12 +64,12 @@ def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
 
 
 def as_dict(entry: Entry, height: int, width: int) -> dict[str, Any]:
-    """A trio as JSON has it; every key is there for every trio.
+    """Return a trio as a JSON object; every trio has every key.
 
     Args:
         entry: The trio.
-        height: Of the images that the patch grid is for, pixels.
-        width: Of these.
+        height: Height of the images that the patch grid is for, pixels.
+        width: Width of these images, pixels.
     """
     card = entry.card
     return {
@@ -131,7 +131,7 @@ def _table(entries: Sequence[Entry], height: int, width: int) -> Table:
 
 
 def _lacking(entry: Entry) -> str:
-    """How much is missing, for the table."""
+    """Say how much of a trio is missing, for the table."""
     counts = {
         "package": sum(bool(package.problem) for package in entry.packages),
         "file": sum(part.path is None for part in entry.weights),
@@ -143,7 +143,7 @@ def _lacking(entry: Entry) -> str:
 
 
 def _advice(entries: Sequence[Entry], config: Config) -> list[str]:
-    """What is missing of which trio, and what to do about it."""
+    """Return lines that say what each trio lacks, and what to do about it."""
     lines, extras = [], set()
     for entry in entries:
         packages = [f"{package.name} {package.problem}" for package in entry.packages if package.problem]

@@ -1,4 +1,4 @@
-"""``fus3dmaps evaluate``: simulated buildings or a published dataset, as records, tables and a report. Needs no ROS."""
+"""``fus3dmaps evaluate``: quality figures of simulated buildings or a published dataset. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _SIMULATED = (
     "map.",
     "fusion.",
 )
-"""Keys, or their beginnings, that mean something to simulated buildings."""
+"""Keys, or their beginnings, of the parameters that have an effect on simulated buildings."""
 _HEADLINE = ("mIoU", "f-mIoU", "accuracy")
 
 Progress = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-"""Shows a bar with this label."""
+"""Shows a progress bar with this label."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is evaluated.
+    """What to evaluate.
 
     Attributes:
         target: ``simulation``, or a dataset's layout.
@@ -52,7 +52,7 @@ class Evaluation:
         seeds: How many buildings are simulated.
         quick: Smaller buildings, and no sweeps in the report.
         jobs: How many buildings are studied at once; 0 for as many as there are processors.
-        options: Of the dataset, e.g. its scene.
+        options: Options of the dataset, e.g. its scene.
     """
 
     target: str
@@ -68,9 +68,9 @@ class Destination:
     """Where the results go.
 
     Attributes:
-        json_file: Records, if wanted.
-        report: Directory of the report, if wanted.
-        console: Headline figures.
+        json_file: File of the records; None for no file.
+        report: Directory of the report; None for no report.
+        console: Shows the headline figures.
     """
 
     json_file: Path | None
@@ -99,14 +99,14 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
     """Evaluate, print the headline figures and write what was asked for.
 
     Args:
-        request: What is evaluated.
-        config: Of the maps; simulated buildings come with models, images and topics of their own.
+        request: What to evaluate.
+        config: Parameters of the maps; simulated buildings bring their own models, images and topics.
         destination: Where the results go.
-        progress: Shows how far it is.
+        progress: Shows progress bars.
 
     Raises:
-        ConfigError: A dataset has no directory, the simulation has one or is given a parameter that means nothing to it, or
-            the plots' package is missing.
+        ConfigError: A dataset has no directory, the simulation has one or is given a parameter that has no effect on it, or
+            the package for plots is missing.
         StorageError: A file cannot be written.
     """
     from fus3dmaps_lab.evaluation.records import write_records
@@ -136,7 +136,7 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
 
 
 def _of_maps(config: Config) -> dict[str, Any]:
-    """What of a configuration is not its default and says how a simulated building is mapped."""
+    """Return the values that differ from their default; refuse those with no effect on simulated buildings."""
     defaults = Config().flat()
     changed = {key: value for key, value in config.flat().items() if value != defaults[key]}
     for key in changed:

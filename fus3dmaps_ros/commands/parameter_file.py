@@ -23,7 +23,7 @@ _SIGNS = {
 
 
 def yaml_with_comments(config: Config) -> str:
-    """A ROS parameter file with every value of a configuration, each under its description and bounds."""
+    """Return a ROS parameter file with every value of a configuration, each under its description and bounds."""
     lines = ["# Parameters of the fus3dmaps node. All of them, with their default values.", "/**:", "  ros__parameters:"]
     values, described = config.flat(), fields()
     for section, holder in Config.model_fields.items():
@@ -47,7 +47,7 @@ def _bounds(field: FieldInfo) -> str:
 
 
 def _scalar(value: Any) -> str:
-    """JSON is YAML, and keeps the decimal point by which ROS tells a double from an integer."""
+    """Return a value as JSON, which is YAML and keeps the decimal point by which ROS tells a double from an integer."""
     return json.dumps(value, ensure_ascii=False)
 
 

@@ -1,4 +1,4 @@
-"""What the commands share: two consoles, progress bars, tables of answers, and the question whether ROS is there."""
+"""What the commands share: two consoles, progress bars, tables of answers, and the check for ROS."""
 
 from __future__ import annotations
 

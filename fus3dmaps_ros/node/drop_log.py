@@ -1,4 +1,4 @@
-"""Lines about drops, few enough not to flood the log."""
+"""Log lines about drops, at a limited rate."""
 
 from __future__ import annotations
 

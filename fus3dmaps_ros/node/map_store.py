@@ -1,4 +1,4 @@
-"""Saving the map of a session and going on from a saved one."""
+"""Saving the map of a session, reading saved maps, and resuming from one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from fus3dmaps_ros.node.session import Session
 
 
 def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
-    """Save the map as it stands; mapping goes on meanwhile.
+    """Save the map as it is now; mapping goes on meanwhile.
 
     Args:
         session: Has the map.
@@ -27,7 +27,7 @@ def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
         The map's path, and its size on disk in bytes.
 
     Raises:
-        StorageError: The name cannot be one, or the map cannot be written; a map that was there still is.
+        StorageError: The name is not allowed, or the map cannot be written; an earlier map of that name stays.
     """
     path = map_path(root, name)
     # Before the map is copied: what is saved may be newer than the stamp, never older.
@@ -36,10 +36,10 @@ def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
 
 
 def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:
-    """Read a saved map into one like the session's, which goes on as it is.
+    """Read a saved map into a new one of the session's kind; the session's own map does not change.
 
     Raises:
-        StorageError: It is no map, damaged, or does not fit the session; the message names what differs.
+        StorageError: There is no map, it is damaged, or it does not fit the session; the message names what differs.
     """
     pipeline = session.pipeline
     fresh = pipeline.empty_map()
@@ -50,7 +50,7 @@ def named_map(root: str, name: str) -> Path:
     """Return the path of the map with this name, or without a name of the one that was saved last.
 
     Raises:
-        StorageError: There is no such map, or the name cannot be one.
+        StorageError: There is no such map, or the name is not allowed.
     """
     if name:
         return map_path(root, name)
@@ -66,7 +66,7 @@ def resume_newest(session: Session, root: str, logger: Any) -> None:
     Args:
         session: Gets the map, which must fit it.
         root: Directory of saved maps.
-        logger: Of the node; is told which map that is, and of each that is passed over, why.
+        logger: The node's logger; gets a line on this map, and on each that is skipped.
     """
     found = _read_newest(session, root, logger.warning)
     if found is None:

@@ -30,7 +30,7 @@ _INT64_MAX = 2**63 - 1
 
 
 def declare_parameters(node: Node) -> Config:
-    """Declare every key of the schema on a node and read the values it was started with.
+    """Declare every key of the schema on a node and read the values that it was started with.
 
     Raises:
         ConfigError: A value is of the wrong type or out of range; the message names the parameter.
@@ -52,7 +52,7 @@ def declare_parameters(node: Node) -> Config:
 
 
 def unknown_overrides(node: Node) -> list[str]:
-    """A sentence for every parameter the node was given in one of the schema's sections but that the schema lacks."""
+    """Return a sentence for every given parameter that is in one of the schema's sections but not in the schema."""
     known = list(fields())
     sections = {key.partition(".")[0] for key in known}
     sentences = []
@@ -71,13 +71,13 @@ def follow_changes(
     apply: Callable[[Config], None],
     is_configured: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Check parameters that are set at run time against the schema and hand on the new configuration.
+    """Check parameters that are set at run time against the schema and apply the new configuration.
 
     Args:
-        node: Whose parameters to watch.
-        read: Gives the configuration in force.
+        node: Has the parameters.
+        read: Returns the current configuration.
         apply: Takes the new one.
-        is_configured: Whether the node has models and a map, which only fit parameters that change at any time.
+        is_configured: Returns whether the node has models and a map; then only ``Changeable`` parameters can change.
     """
     known = fields()
 

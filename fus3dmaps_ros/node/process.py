@@ -1,4 +1,4 @@
-"""A node in a process of its own, from its arguments to an exit code, whatever signals and errors come."""
+"""Running a node as a process: from arguments to an exit code, with signals and errors handled."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class StoppableNode(Protocol):
 
     @property
     def autostart(self) -> bool:
-        """Whether it is brought up at once, without a lifecycle manager."""
+        """Whether the node is brought up at once, without a lifecycle manager."""
         ...
 
     def bring_up(self) -> None:
@@ -34,15 +34,15 @@ class StoppableNode(Protocol):
         ...
 
     def stop(self, timeout_s: float) -> bool:
-        """End its work; return whether that was done in time."""
+        """Stop working; return whether that was done in time."""
         ...
 
     def save_last(self, hurried: Callable[[], bool]) -> bool:
-        """Save a last time, after :meth:`stop`, while ``hurried()`` is false; return whether no save is in work."""
+        """Save a last time after :meth:`stop`, while ``hurried()`` is false; return whether no save is in progress."""
         ...
 
     def destroy_node(self) -> None:
-        """Give back what ROS holds of it."""
+        """Free what ROS holds of the node."""
         ...
 
     def get_logger(self) -> Any:
@@ -54,9 +54,9 @@ def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[s
     """Run a node until SIGINT or SIGTERM.
 
     Args:
-        name: Begins each line on stderr.
-        make_node: Makes the node, once ROS is initialised.
-        args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
+        name: The program's name, at the start of each line on stderr.
+        make_node: Makes the node, after ROS is initialised.
+        args: Arguments without the program's name, ``--ros-args ...``; by default those of the process.
 
     Returns:
         Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
@@ -66,7 +66,7 @@ def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[s
     code = 0
     node, executor = None, None
     try:
-        # Without rclpy's handlers, which would pull the context from under callbacks in work.
+        # Without rclpy's handlers, which would shut the context down while callbacks are running.
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         stray = remove_ros_args(arguments)
         if stray:
@@ -74,10 +74,10 @@ def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[s
         node = make_node()
         executor = CallbackExecutor()
         executor.add_node(node)
-        # Python runs signal handlers in the main thread alone, and not while that waits inside the middleware.
+        # Python runs signal handlers only in the main thread, and not while that waits inside the middleware.
         spinning = ThreadPoolExecutor(1, "spin").submit(executor.spin_on, node.get_logger().error)
         if node.autostart:
-            # While it spins: a manager or an operator can see the state while the models load.
+            # While it spins, so that a manager or an operator can see the state while the models load.
             node.bring_up()
         spinning.result()
     except KeyboardInterrupt:
@@ -95,7 +95,7 @@ def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[s
 def _shut_down(
     name: str, node: StoppableNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int
 ) -> None:
-    """Take everything down within two seconds, but for a last save where that is due."""
+    """Shut everything down within two seconds, apart from a last save if one is due."""
     signals.hold()
     unfinished = []
     if executor is not None and not executor.shutdown(_STOP_TIMEOUT_S / 2):
@@ -109,7 +109,7 @@ def _shut_down(
     rclpy.try_shutdown()
     if unfinished:
         print(f"{name}: ending in the middle of a {' and a '.join(unfinished)}", file=sys.stderr)
-        # The interpreter's own end would wait for native code that is in work, or crash it.
+        # A normal exit would wait for native code that is still running, or crash it.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)

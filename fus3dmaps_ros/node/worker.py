@@ -1,4 +1,4 @@
-"""A bounded queue and the one thread that feeds the pipeline, so that no callback ever waits for a network."""
+"""The mapping thread and its bounded queue, so that no callback ever waits for a network."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ T = TypeVar("T")
 
 
 class FrameObserver(Protocol):
-    """Follows frames on their way; each method must return at once."""
+    """Someone who follows frames on their way to the map; each method must return at once."""
 
     def offered(self, waiting: int) -> None:
-        """Take note that a frame was queued and that ``waiting`` of them wait now."""
+        """Note that a frame was queued; ``waiting`` frames wait now."""
         ...
 
     def decoded(self, paired: PairedMessages, frame: PosedFrame) -> None:
-        """Take note that a keyframe was decoded and is about to be mapped."""
+        """Note that a keyframe was decoded and is about to be mapped."""
         ...
 
     def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
-        """Take note that a frame is done: seconds by stage, none if it was no keyframe or failed, and how many wait."""
+        """Note that a frame is done: seconds by stage (none if it was no keyframe or failed), and how many frames wait."""
         ...
 
 
 class FrameWorker:
-    """Maps paired messages in order of arrival; when the queue is full the oldest one goes.
+    """Maps paired messages in order of arrival; when the queue is full the oldest one is dropped.
 
-    A frame that fails is counted under its reason (``processing_failed`` for anything but a FrameError) and the thread
-    goes on with the next one.
+    A frame that fails is counted under its reason (``processing_failed`` for anything but a FrameError), and the thread
+    continues with the next one.
 
     Attributes:
         observer: Follows every frame; None for nobody. May be changed at any time.
@@ -73,7 +73,7 @@ class FrameWorker:
 
     @property
     def stamp_ns(self) -> int:
-        """Stamp of the latest frame in the map, nanoseconds; of the first one from when it is begun, and 0 before."""
+        """Stamp of the latest frame in the map, nanoseconds; that of the first frame from its start on, and 0 before."""
         with self._wake:
             return self._stamp_ns
 
@@ -131,7 +131,7 @@ class FrameWorker:
         return future
 
     def drop_waiting(self) -> None:
-        """Drop the frames that wait."""
+        """Drop the frames that wait, without counting them."""
         with self._wake:
             self._frames.clear()
 
@@ -157,7 +157,7 @@ class FrameWorker:
         return self.between_frames(swap)
 
     def stop(self, timeout_s: float) -> bool:
-        """Let the frame in work finish and end the thread; what waits is dropped.
+        """End the thread after the frame that is being mapped; drop those that wait.
 
         Returns:
             Whether the thread has ended within the time.
@@ -207,7 +207,7 @@ class FrameWorker:
         try:
             report = self._step.run(paired)
         except Exception:
-            # Whatever a network or a driver throws at one frame must not end a day of mapping. One layer may have it.
+            # An exception of a network or a driver must not end a day of mapping. One layer may already have the frame.
             self._revise(True)
             self.ledger.drops.add(
                 "processing_failed", f"the image at {paired.stamp_ns} ns could not be mapped\n{traceback.format_exc()}"
@@ -225,5 +225,5 @@ class FrameWorker:
         if observer is not None:
             observer.decoded(paired, frame)
         with self._wake:
-            # The first layer of the first frame can be asked for before its second is done.
+            # The first layer of the first frame can be queried before the second layer has it.
             self._stamp_ns = self._stamp_ns or paired.stamp_ns

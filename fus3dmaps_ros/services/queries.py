@@ -1,4 +1,4 @@
-"""The services that ask: ``~/query_text``, ``~/query_image``, ``~/label_map`` and ``~/list_instances``."""
+"""The services that answer: ``~/query_text``, ``~/query_image``, ``~/label_map`` and ``~/list_instances``."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from fus3dmaps_ros.topics.outputs import Outputs
 
 
 class QueryServices(ServiceGroup):
-    """Answers questions while mapping goes on; none of them changes the map."""
+    """Answers questions while mapping goes on, without changing the map."""
 
     def __init__(self, node: Node, sessions: SessionHolder, outputs: Outputs, read: Callable[[], Config]) -> None:
         """Offer the services.
 
         Args:
             node: Owner of the services.
-            sessions: Whose map and encoders answer.
+            sessions: Has the map and the encoders.
             outputs: Publishes answers.
-            read: Gives the configuration in force.
+            read: Returns the current configuration.
         """
         super().__init__(node, read)
         self._sessions = sessions
@@ -61,7 +61,7 @@ class QueryServices(ServiceGroup):
         session = self._sessions.require()
         query, pipeline = self._to_query(request, [IMAGE_PROMPT]), session.pipeline
         rgb = messages.decode_color(request.image, "image")
-        # By the mapping thread: its encoder need not be thread-safe, and a second copy would not fit the GPU.
+        # In the mapping thread: the encoder need not be thread-safe, and a second one might not fit on the GPU.
         crop = pipeline.trio.crop
         encoded = session.worker.between_frames(lambda: embed_image(crop, rgb), changes=False)
         embedding = call.in_time(lambda: between_frames(encoded, call.deadline))
@@ -107,7 +107,7 @@ class QueryServices(ServiceGroup):
 
     def _answer(self, request: Any, response: Any, call: Call, find: Callable[[], QueryAnswer]) -> str:
         """Find the answer, fill it into the response, and publish it if the request says so."""
-        # Before the map is read: what it holds may be newer than the stamp, never older.
+        # Before the map is read, so that its content may be newer than the stamp but never older.
         header = self._outputs.header()
         found = call.in_time(find)
         response.instances = [conversions.to_instance(header, instance) for instance in found.instances]

@@ -1,4 +1,4 @@
-"""Subscriptions to what cameras and a localisation publish, paired into frames."""
+"""Subscriptions to cameras and poses, whose messages are paired into frames."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ _TYPES: dict[str, type[Any]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
     "nav_msgs/msg/Odometry": Odometry,
 }
-# Deep enough to ride out a pause of the interpreter of a third of a second at 30 Hz; the profile's usual 5 are not.
+# Deep enough for a pause of the interpreter of a third of a second at 30 Hz; the usual depth of 5 is not.
 _IMAGE_DEPTH = 10
 _POSE_DEPTH = 200
 _POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
-_TF_PERIOD_S = 0.02  # How soon after a transform the image that waits for it goes on.
+_TF_PERIOD_S = 0.02  # Longest time that an image waits after its transform has come.
 
 
 class Inputs:
-    """Subscribes to colour, depth, camera models and poses, and hands complete frames on.
+    """Subscribes to colour, depth, camera models and poses, and passes complete frames on.
 
     Attributes:
-        streams: What is subscribed to.
+        streams: The topics and their message types.
     """
 
     def __init__(
@@ -56,12 +56,12 @@ class Inputs:
         Args:
             node: Owner of the subscriptions.
             config: Topics, pairing and QoS.
-            take: Gets every complete frame, in stamp order; must not block.
-            drops: Counts what led to no frame.
-            arrived: Is told the topic and the stamp (nanoseconds) of every message.
+            take: Called with every complete frame, in stamp order; must not block.
+            drops: Counts messages that led to no frame.
+            arrived: Called with the topic and the stamp (nanoseconds) of every message.
 
         Raises:
-            ConfigError: A mounting is not a pose, or TF is wanted and not installed.
+            ConfigError: A mounting is not a pose, or TF is needed and not installed.
         """
         self._node = node
         self._lock = threading.Lock()
@@ -84,7 +84,7 @@ class Inputs:
         ]
         self._timer = None
         if self._tf is not None:
-            # What comes on /tf passes by the pairer. The clock of the machine: that of a simulation may stand still.
+            # The pairer does not see messages on /tf, so it is polled. A steady clock: that of a simulation may stand still.
             self._timer = node.create_timer(
                 _TF_PERIOD_S, self._hand_on, callback_group=group, clock=Clock(clock_type=ClockType.STEADY_TIME)
             )
@@ -95,7 +95,7 @@ class Inputs:
             self._pairer.reset()
 
     def close(self) -> None:
-        """Unsubscribe and forget what waits. Of no further use then; can be called again."""
+        """Unsubscribe for good and forget what waits; can be called again."""
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
