@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from fus3dmaps_core.errors import FrameError
 from fus3dmaps_core.frame import PosedFrame
@@ -13,25 +13,19 @@ from fus3dmaps_core.pipeline import FrameReport, Pipeline
 from fus3dmaps_core.sources.paired import PairedMessages
 
 
+@dataclass(frozen=True)
 class FrameStep:
-    """Gives paired messages to the pipeline one by one and counts what happens; only keyframes are decoded."""
+    """Gives paired messages to the pipeline one by one and counts what happens; only keyframes are decoded.
 
-    def __init__(
-        self,
-        pipeline: Pipeline,
-        ledger: Ledger,
-        on_decoded: Callable[[PairedMessages, PosedFrame], None] | None = None,
-    ) -> None:
-        """Keep the parts.
+    Attributes:
+        pipeline: Maps the frames.
+        ledger: Counts them.
+        on_decoded: Called with each keyframe before it is mapped.
+    """
 
-        Args:
-            pipeline: Maps the frames.
-            ledger: Counts them.
-            on_decoded: Called with each keyframe before it is mapped.
-        """
-        self._pipeline = pipeline
-        self._ledger = ledger
-        self._on_decoded = on_decoded
+    pipeline: Pipeline
+    ledger: Ledger
+    on_decoded: Callable[[PairedMessages, PosedFrame], None] | None = None
 
     def run(self, paired: PairedMessages) -> FrameReport | None:
         """Map a frame if it is a keyframe.
@@ -43,22 +37,22 @@ class FrameStep:
         Raises:
             EncoderError: As :meth:`Pipeline.process`.
         """
-        if not self._pipeline.wants(paired.T_world_camera):
-            self._ledger.add_not_keyframe()
+        if not self.pipeline.wants(paired.T_world_camera):
+            self.ledger.add_not_keyframe()
             return None
         try:
             report = self._map(paired)
         except FrameError as error:
-            self._ledger.drops.add(error.reason, str(error))
+            self.ledger.drops.add(error.reason, str(error))
             return None
-        self._ledger.add_keyframe(report.dense, report.instances, report.proposals, report.durations_s)
+        self.ledger.add_keyframe(report.dense, report.instances, report.proposals, report.durations_s)
         return report
 
     def _map(self, paired: PairedMessages) -> FrameReport:
         started_s = time.perf_counter()
-        frame = paired.decode(self._pipeline.config.image)
+        frame = paired.decode(self.pipeline.config.image)
         decode_s = time.perf_counter() - started_s
-        if self._on_decoded is not None:
-            self._on_decoded(paired, frame)
-        report = self._pipeline.process(frame)
+        if self.on_decoded is not None:
+            self.on_decoded(paired, frame)
+        report = self.pipeline.process(frame)
         return replace(report, durations_s={"decode": decode_s, **report.durations_s})

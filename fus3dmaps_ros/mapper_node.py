@@ -68,15 +68,11 @@ class MapperNode(ManagedNode):
         self.autosave: Autosave | None = None
         self.drops = Drops(DropLog(logger.warning).report)
         self.config = declare_parameters(self)
+        self.autostart = self.config.node.autostart
         for sentence in unknown_overrides(self):
             logger.warning(sentence)
         follow_changes(self, self._read_config, self._apply_config, lambda: self.state != UNCONFIGURED)
         self._status = StatusPublisher(self, self._read_config, self.status_message, self._log_line)
-
-    @property
-    def autostart(self) -> bool:
-        """Whether the node starts to map by itself, without a lifecycle manager."""
-        return self.config.node.autostart
 
     @property
     def session(self) -> Session | None:
@@ -169,24 +165,13 @@ class MapperNode(ManagedNode):
         self._sessions.replace(None)
 
     def stop(self, timeout_s: float) -> bool:
-        """Unsubscribe and end the mapping thread, in any state; the map stays, and :meth:`save_last` can still save it.
-
-        Returns:
-            Whether the thread ended in time.
-        """
+        """Unsubscribe and end the mapping thread, in any state; the map stays. Return whether the thread ended in time."""
         self.deactivate()
         session = self.session
         return session is None or session.worker.stop(timeout_s)
 
     def save_last(self, hurried: Callable[[], bool]) -> bool:
-        """Save the map a last time after :meth:`stop`, if it is saved periodically and has changed.
-
-        Args:
-            hurried: Called repeatedly; returns whether to stop waiting.
-
-        Returns:
-            Whether no save is in progress: see :meth:`Autosave.save_last`, which may take ``node.service_timeout_s``.
-        """
+        """Save the map a last time after :meth:`stop`, if that is due, within ``node.service_timeout_s``."""
         autosave = self.autosave
         return autosave is None or autosave.save_last(self.config.node.service_timeout_s, hurried)
 
@@ -254,11 +239,8 @@ def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pi
     lifecycle manager.
 
     Args:
-        args: Arguments without the program's name, ``--ros-args ...``; by default those of the process.
+        args: See :func:`run_node`, also for the exit code that is returned.
         make_pipeline: See :class:`MapperNode`.
-
-    Returns:
-        Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
     """
     return run_node(NODE_NAME, lambda: MapperNode(make_pipeline), args)
 

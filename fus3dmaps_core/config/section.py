@@ -1,10 +1,11 @@
-"""The base of every section of the schema, and the marks that say when a parameter can change."""
+"""The base of every section of the schema, and what a field says about its parameter besides type and default."""
 
 from __future__ import annotations
 
 from enum import Enum
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
+import annotated_types
 from pydantic import BaseModel, ConfigDict
 from pydantic.fields import FieldInfo
 
@@ -35,3 +36,23 @@ Fixed = Annotated[T, Changes.NEVER]
 def when_it_changes(field: FieldInfo) -> Changes:
     """Return the mark of a field; without one it shapes the models, the map or the topics of a configured node."""
     return next((mark for mark in field.metadata if isinstance(mark, Changes)), Changes.UNCONFIGURED)
+
+
+_SIGNS = {
+    annotated_types.Ge: (">=", "ge"),
+    annotated_types.Gt: (">", "gt"),
+    annotated_types.Le: ("<=", "le"),
+    annotated_types.Lt: ("<", "lt"),
+}
+
+
+def bounds(field: FieldInfo) -> dict[str, Any]:
+    """Return the bounds of a field by their sign: ``>=``, ``>``, ``<=`` or ``<``."""
+    signs = [(bound, *_SIGNS[type(bound)]) for bound in field.metadata if type(bound) in _SIGNS]
+    return {sign: getattr(bound, name) for bound, sign, name in signs}
+
+
+def choices(field: FieldInfo) -> tuple[str, ...]:
+    """Return the texts that a field allows; empty if it is not a choice of texts."""
+    values = getattr(field.annotation, "__args__", ())
+    return values if all(isinstance(value, str) for value in values) else ()

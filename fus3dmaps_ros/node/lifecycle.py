@@ -27,6 +27,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     any time, even during a long transition.
 
     Attributes:
+        autostart: Whether the node is brought up when it starts, without a lifecycle manager.
         failure: The exception of the last transition; None if it succeeded.
     """
 
@@ -37,6 +38,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
             name: The node's name.
             options: Options of ``rclpy.node.Node``.
         """
+        self.autostart = False
         self.failure: Exception | None = None
         self._transition = threading.Lock()
         Node.__init__(self, name, **options)
@@ -73,6 +75,14 @@ class ManagedNode(LifecycleNodeMixin, Node):
 
     def cleanup(self) -> None:
         """Free what :meth:`configure` has made, even if it made only part of it."""
+        raise NotImplementedError
+
+    def stop(self, timeout_s: float) -> bool:
+        """Stop working, in any state, because the process ends; return whether that was done in time."""
+        raise NotImplementedError
+
+    def save_last(self, hurried: Callable[[], bool]) -> bool:
+        """Save what is due after :meth:`stop`, until ``hurried()`` is true; return whether no save is in progress."""
         raise NotImplementedError
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import annotated_types
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -15,7 +14,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fus3dmaps_core.config.schema import Config, fields
-from fus3dmaps_core.config.section import Changes, when_it_changes
+from fus3dmaps_core.config.section import Changes, bounds, choices, when_it_changes
 from fus3dmaps_core.errors import ConfigError
 
 _TYPES = {
@@ -104,44 +103,25 @@ def follow_changes(
 
 
 def _descriptor(field: FieldInfo) -> ParameterDescriptor:
-    changes = when_it_changes(field)
+    changes, limits, allowed = when_it_changes(field), bounds(field), choices(field)
     descriptor = ParameterDescriptor(description=field.description or "", read_only=changes == Changes.NEVER)
-    lower: float | None = None
-    upper: float | None = None
-    exclusive = []
-    for bound in field.metadata:
-        match bound:
-            case annotated_types.Ge(ge=limit):
-                lower = limit  # type: ignore[assignment]
-            case annotated_types.Gt(gt=limit):
-                lower = limit  # type: ignore[assignment]
-                exclusive.append(f"> {limit}")
-            case annotated_types.Le(le=limit):
-                upper = limit  # type: ignore[assignment]
-            case annotated_types.Lt(lt=limit):
-                upper = limit  # type: ignore[assignment]
-                exclusive.append(f"< {limit}")
     # ROS ranges are closed; the schema refuses the open end itself.
-    when = ["changes only while the node is unconfigured"] if changes == Changes.UNCONFIGURED else []
-    descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive, *when])
-    if lower is None and upper is None:
-        return descriptor
-    if isinstance(field.default, int):
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=-_INT64_MAX if lower is None else int(lower), to_value=_INT64_MAX if upper is None else int(upper)
-            )
-        ]
-    elif isinstance(field.default, float):
-        largest = sys.float_info.max
-        descriptor.floating_point_range = [
-            FloatingPointRange(
-                from_value=-largest if lower is None else float(lower), to_value=largest if upper is None else float(upper)
-            )
-        ]
+    constraints = [f"{sign} {limit}" for sign, limit in limits.items() if sign in "><"]
+    if allowed:
+        constraints.insert(0, f"one of {', '.join(allowed)}")
+    if changes == Changes.UNCONFIGURED:
+        constraints.append("changes only while the node is unconfigured")
+    descriptor.additional_constraints = ", ".join(constraints)
+    lower, upper = limits.get(">=", limits.get(">")), limits.get("<=", limits.get("<"))
+    if limits and isinstance(field.default, int):
+        descriptor.integer_range = [_closed(IntegerRange, int, lower, upper, _INT64_MAX)]
+    elif limits and isinstance(field.default, float):
+        descriptor.floating_point_range = [_closed(FloatingPointRange, float, lower, upper, sys.float_info.max)]
     return descriptor
 
 
-def _choices(field: FieldInfo) -> list[str]:
-    values = getattr(field.annotation, "__args__", ())
-    return [f"one of {', '.join(values)}"] if values and all(isinstance(value, str) for value in values) else []
+def _closed(kind: Any, number: Callable[[Any], Any], lower: Any, upper: Any, largest: Any) -> Any:
+    """Make a ROS range; a bound that is None is as far away as the type allows."""
+    return kind(
+        from_value=-largest if lower is None else number(lower), to_value=largest if upper is None else number(upper)
+    )

@@ -7,7 +7,6 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Protocol
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -15,42 +14,14 @@ from rclpy.utilities import remove_ros_args
 
 from fus3dmaps_core.errors import ConfigError
 from fus3dmaps_ros.node.executor import CallbackExecutor
+from fus3dmaps_ros.node.lifecycle import ManagedNode
 from fus3dmaps_ros.node.refusals import REFUSALS, one_line
 from fus3dmaps_ros.node.signals import StopSignals
 
 _STOP_TIMEOUT_S = 1.0
 
 
-class StoppableNode(Protocol):
-    """A managed node that can be started at once and taken down in two steps."""
-
-    @property
-    def autostart(self) -> bool:
-        """Whether the node is brought up at once, without a lifecycle manager."""
-        ...
-
-    def bring_up(self) -> None:
-        """Configure and activate."""
-        ...
-
-    def stop(self, timeout_s: float) -> bool:
-        """Stop working; return whether that was done in time."""
-        ...
-
-    def save_last(self, hurried: Callable[[], bool]) -> bool:
-        """Save a last time after :meth:`stop`, while ``hurried()`` is false; return whether no save is in progress."""
-        ...
-
-    def destroy_node(self) -> None:
-        """Free what ROS holds of the node."""
-        ...
-
-    def get_logger(self) -> Any:
-        """Return the node's logger."""
-        ...
-
-
-def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[str] | None = None) -> int:
+def run_node(name: str, make_node: Callable[[], ManagedNode], args: Sequence[str] | None = None) -> int:
     """Run a node until SIGINT or SIGTERM.
 
     Args:
@@ -93,7 +64,7 @@ def run_node(name: str, make_node: Callable[[], StoppableNode], args: Sequence[s
 
 
 def _shut_down(
-    name: str, node: StoppableNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int
+    name: str, node: ManagedNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int
 ) -> None:
     """Shut everything down within two seconds, apart from a last save if one is due."""
     signals.hold()

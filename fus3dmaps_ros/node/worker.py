@@ -27,15 +27,12 @@ class FrameObserver(Protocol):
 
     def offered(self, waiting: int) -> None:
         """Note that a frame was queued; ``waiting`` frames wait now."""
-        ...
 
     def decoded(self, paired: PairedMessages, frame: PosedFrame) -> None:
         """Note that a keyframe was decoded and is about to be mapped."""
-        ...
 
     def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
         """Note that a frame is done: seconds by stage (none if it was no keyframe or failed), and how many frames wait."""
-        ...
 
 
 class FrameWorker:
