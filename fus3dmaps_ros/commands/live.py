@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fus3dmaps_ros.commands.settings import directory
+from fus3dmaps_ros.commands.settings import AnswerAsJson, Layer, Negative, Prompts, directory
 from fus3dmaps_ros.commands.terminal import OUT, need_ros, print_answer
 
 
@@ -33,13 +33,13 @@ def play(
 
 
 def ask(
-    prompts: Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")],
+    prompts: Prompts,
     top: Annotated[int, typer.Option("--top", min=1, help="Answers per prompt.")] = 5,
-    layer: Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")] = "",
-    negative: Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")] = None,
+    layer: Layer = "",
+    negative: Negative = None,
     node_name: Annotated[str, typer.Option("--node", help="The mapper node.")] = "/fus3dmaps",
     timeout: Annotated[float, typer.Option("--timeout", min=0.1, help="Longest wait for the node, seconds.")] = 10.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")] = False,
+    as_json: AnswerAsJson = False,
 ) -> None:
     """Ask a running mapper node where something is, and have it publish the similarities."""
     need_ros()

@@ -11,7 +11,16 @@ import typer
 from rich.table import Table
 
 from fus3dmaps_core.errors import RecordingError
-from fus3dmaps_ros.commands.settings import ParamsFile, Settings, configuration, directory
+from fus3dmaps_ros.commands.settings import (
+    AnswerAsJson,
+    Layer,
+    Negative,
+    ParamsFile,
+    Prompts,
+    Settings,
+    configuration,
+    directory,
+)
 from fus3dmaps_ros.commands.terminal import LOG, OUT, print_answer, progress
 
 if TYPE_CHECKING:
@@ -86,12 +95,12 @@ def _figures(summary: RunSummary, semantic_map: SemanticMap) -> dict[str, Any]:
 
 def query(
     map_directory: Annotated[Path, typer.Argument(metavar="MAPDIR", help="A saved map.")],
-    prompts: Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")],
+    prompts: Prompts,
     top: Annotated[int | None, typer.Option("--top", min=1, help="Answers per prompt.")] = None,
-    layer: Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")] = "",
-    negative: Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")] = None,
+    layer: Layer = "",
+    negative: Negative = None,
     threshold: Annotated[float | None, typer.Option("--threshold", help="Leave out what scores less.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")] = False,
+    as_json: AnswerAsJson = False,
     png: Annotated[Path | None, typer.Option("--png", help="Draw the answer into this picture.")] = None,
     ply: Annotated[Path | None, typer.Option("--ply", help="Write voxel similarities to this PLY file.")] = None,
     weights: Annotated[

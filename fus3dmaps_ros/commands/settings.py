@@ -1,4 +1,4 @@
-"""The options ``--params-file``, ``--set``, ``--option`` and ``--out``, which several commands share."""
+"""Options that several commands share, and how the texts of ``--set``, ``--option`` and ``--out`` are read."""
 
 from __future__ import annotations
 
@@ -14,6 +14,10 @@ from fus3dmaps_core.errors import ConfigError
 ParamsFile = Annotated[Path | None, typer.Option("--params-file", help="YAML file of parameters, as for the node.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="A parameter, e.g. map.voxel_size_m=0.1; repeatable.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11; repeatable.")]
+Prompts = Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")]
+Layer = Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")]
+Negative = Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")]
+AnswerAsJson = Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")]
 
 
 def configuration(params_file: Path | None, settings: list[str] | None) -> Config:
