@@ -3,67 +3,56 @@
 from __future__ import annotations
 
 import gc
-import os
 import sys
 import time
-import traceback
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import rclpy
 import torch
-from rclpy.signals import SignalHandlerOptions
-from rclpy.utilities import remove_ros_args
 from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_core.errors import ConfigError
+from fus3dmaps_core.ledger import Drops, Ledger
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.sources.streams import uses_tf
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
-from fus3dmaps_ros.node.drops import DropLog
-from fus3dmaps_ros.node.executor import CallbackExecutor
+from fus3dmaps_ros.node.drop_log import DropLog
 from fus3dmaps_ros.node.lifecycle import UNCONFIGURED, ManagedNode
-from fus3dmaps_ros.node.map_store import read_newest
+from fus3dmaps_ros.node.map_store import resume_newest
 from fus3dmaps_ros.node.parameters import declare_parameters, follow_changes, unknown_overrides
-from fus3dmaps_ros.node.refusals import REFUSALS, one_line
+from fus3dmaps_ros.node.process import run_node
 from fus3dmaps_ros.node.session import Session, SessionHolder
-from fus3dmaps_ros.node.signals import StopSignals
-from fus3dmaps_ros.node.timed_calls import Deadline
 from fus3dmaps_ros.node.worker import FrameWorker
+from fus3dmaps_ros.reporting.health_monitor import HealthMonitor
 from fus3dmaps_ros.reporting.status import StatusPublisher, status_line, status_message
-from fus3dmaps_ros.reporting.watch import Watch
-from fus3dmaps_ros.services.map_services import MapServices
-from fus3dmaps_ros.services.query_services import QueryServices
+from fus3dmaps_ros.services.maps import MapServices
+from fus3dmaps_ros.services.queries import QueryServices
 from fus3dmaps_ros.topics.inputs import Inputs
 from fus3dmaps_ros.topics.outputs import Outputs
 from fus3dmaps_ros.topics.tf_poses import import_tf2_ros
 
 NODE_NAME = "fus3dmaps"
-_STOP_TIMEOUT_S = 1.0
-_POLL_S = 0.05
 
 
 class MapperNode(ManagedNode):
     """Maps what the camera sees and answers questions about it.
 
-    Unconfigured it has neither models nor a map; inactive it has both and answers, but takes no images; active it maps. Its
-    topics and services appear when it is configured for the first time.
+    While unconfigured it has neither models nor a map. While inactive it has both and answers, but takes no images. While
+    active it maps. Its topics and services appear when it is configured for the first time.
 
     Attributes:
         config: The configuration in force.
-        drops: Counts messages and frames that were dropped.
-        autosave: Saves the map by period; None while unconfigured.
+        drops: Counts of messages and frames that were dropped.
+        autosave: Saves the map periodically; None while unconfigured.
     """
 
     def __init__(self, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config, **options: Any) -> None:
-        """Read the parameters; nothing is loaded yet.
+        """Read the parameters, without loading anything.
 
         Args:
-            make_pipeline: Builds the pipeline from the configuration; loads the models.
-            options: For ``rclpy.node.Node``, e.g. ``context``, ``namespace`` or ``parameter_overrides``.
+            make_pipeline: Builds the pipeline from the configuration and loads the models.
+            options: Options of ``rclpy.node.Node``, e.g. ``context``, ``namespace`` or ``parameter_overrides``.
 
         Raises:
             ConfigError: A parameter is wrong; the message names it.
@@ -75,10 +64,11 @@ class MapperNode(ManagedNode):
         self._outputs: Outputs | None = None
         self._offered: list[QueryServices | MapServices] = []
         self._inputs: Inputs | None = None
-        self._watch: Watch | None = None
+        self._monitor: HealthMonitor | None = None
         self.autosave: Autosave | None = None
-        self.drops = DropLog(logger.warning)
+        self.drops = Drops(DropLog(logger.warning).report)
         self.config = declare_parameters(self)
+        self.autostart = self.config.node.autostart
         for sentence in unknown_overrides(self):
             logger.warning(sentence)
         follow_changes(self, self._read_config, self._apply_config, lambda: self.state != UNCONFIGURED)
@@ -100,30 +90,30 @@ class MapperNode(ManagedNode):
         return self._sessions.require().worker
 
     def configure(self) -> None:
-        """Load and warm up the models, resume a saved map where that is wanted, and offer topics and services.
+        """Load and warm up the models, resume a saved map if configured, and offer topics and services.
 
         Raises:
-            ConfigError: TF is wanted and not installed.
+            ConfigError: TF is needed and not installed.
             EncoderError: A model cannot be loaded.
         """
         logger, config = self.get_logger(), self.config
         if uses_tf(config.input):
-            import_tf2_ros()  # Before the models are loaded for nothing.
+            import_tf2_ros()  # Refuses before models are loaded in vain.
         logger.info(f"loading encoder '{config.encoder.name}' and segmenter '{config.segmenter.name}'")
         started = time.monotonic()
         pipeline = self._make_pipeline(config)
         logger.info(f"models loaded in {time.monotonic() - started:.1f} s")
-        session = Session(pipeline, FrameWorker(pipeline, config.node.queue_size, self.drops))
+        session = Session(pipeline, FrameWorker(pipeline, config.node.queue_size, Ledger(self.drops)))
         session.worker.start()
         self._sessions.replace(session)
         if self.config is not config:
-            self._apply_config(self.config)  # Set while the models were loaded.
+            self._apply_config(self.config)  # It changed while the models were loaded.
         if config.node.resume:
-            self._resume(session)
+            resume_newest(session, config.node.map_directory, logger)
         self.autosave = Autosave(session, self._read_config, logger)
         self.autosave.start()
         if self._outputs is None:
-            # Once: a service or publisher that is destroyed while a callback uses it would take the executor with it.
+            # Only once: destroying a service or publisher that a callback is using would end the executor.
             self._outputs = Outputs(self, self._sessions, self._read_config)
             self._offered = [
                 QueryServices(self, self._sessions, self._outputs, self._read_config),
@@ -131,31 +121,33 @@ class MapperNode(ManagedNode):
             ]
 
     def activate(self) -> None:
-        """Subscribe to the inputs and map.
+        """Subscribe to the inputs and start mapping.
 
         Raises:
-            ConfigError: The inputs' parameters cannot be used.
+            ConfigError: The parameters of the inputs cannot be used.
         """
         self._inputs = Inputs(self, self.config, self.worker.offer, self.drops, self._arrived)
-        self._watch = Watch(self, self.config, self._inputs.streams, self._sessions.require())
-        self.worker.observer, self.drops.observe = self._watch, self._watch.dropped
+        self._monitor = HealthMonitor(self, self.config, self._inputs.streams, self._sessions.require())
+        self.worker.observer = self._monitor
+        self.drops.tell(self._monitor.dropped)
         self.get_logger().info("ready")
 
     def deactivate(self) -> None:
-        """Unsubscribe; what waits to be mapped is dropped, the map stays."""
+        """Unsubscribe and drop the frames that wait; the map stays."""
         inputs, self._inputs = self._inputs, None
         if inputs is not None:
             inputs.close()
-        session, watch = self.session, self._watch
+        session = self.session
         if session is not None:
             session.worker.drop_waiting()
             session.worker.observer = None
-        self.drops.observe, self._watch = None, None
-        if watch is not None:
-            watch.close()
+        monitor, self._monitor = self._monitor, None
+        if monitor is not None:
+            self.drops.stop_telling(monitor.dropped)
+            monitor.close()
 
     def cleanup(self) -> None:
-        """Free the map and the models; a map that is saved by period is saved a last time."""
+        """Free the map and the models, after a last save if the map is saved periodically."""
         self._end_session()
         if self._outputs is not None:
             self._outputs.clear_answers()
@@ -173,41 +165,23 @@ class MapperNode(ManagedNode):
         self._sessions.replace(None)
 
     def stop(self, timeout_s: float) -> bool:
-        """Unsubscribe and end the mapping thread, whatever the state; whether it ended in time.
-
-        The map stays, and can still be saved by :meth:`save_last`.
-        """
+        """Unsubscribe and end the mapping thread, in any state; the map stays. Return whether the thread ended in time."""
         self.deactivate()
         session = self.session
         return session is None or session.worker.stop(timeout_s)
 
     def save_last(self, hurried: Callable[[], bool]) -> bool:
-        """Save a map that is saved by period a last time, if it has changed, after :meth:`stop`.
-
-        Args:
-            hurried: Whether not to wait any longer; asked again and again.
-
-        Returns:
-            Whether no save is in work any more. One that was hurried or takes longer than ``node.service_timeout_s`` is; if
-            the process ends in it, the map that was saved before is left.
-        """
+        """Save the map a last time after :meth:`stop`, if that is due, within ``node.service_timeout_s``."""
         autosave = self.autosave
-        if autosave is None:
-            return True
-        if autosave.is_due:
-            self.get_logger().info("saving the map; another signal ends at once")
-        deadline = Deadline(self.config.node.service_timeout_s)
-        while not autosave.stop(min(_POLL_S, deadline.remaining_s()), save=True):
-            if hurried() or not deadline.remaining_s():
-                return False
-        return True
+        return autosave is None or autosave.save_last(self.config.node.service_timeout_s, hurried)
 
     def status(self) -> str:
-        """One line on what came in, what was mapped, what was dropped and how large the map is."""
+        """Describe in one line what came in, what was mapped, what was dropped and how large the map is."""
         return status_line(self.session, self.drops.counts())
 
     def status_message(self) -> MapperStatus:
-        """The report of this moment, as on ``~/status``."""
+        """Make the message that ``~/status`` publishes now."""
+        monitor = self._monitor
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=self.config.input.map_frame)
         return status_message(
             header,
@@ -216,19 +190,9 @@ class MapperNode(ManagedNode):
             self.session,
             self.autosave,
             self.drops.counts(),
-            {} if self._watch is None else self._watch.diagnosis.rates_hz(),
+            {} if monitor is None else monitor.diagnosis.rates_hz(),
             self.problems(),
         )
-
-    def _resume(self, session: Session) -> None:
-        logger, root = self.get_logger(), self.config.node.map_directory
-        found = read_newest(session, root, logger.warning)
-        if found is None:
-            logger.info(f"no map to resume in '{root}'; starting with an empty one")
-            return
-        name, semantic_map, info = found
-        session.worker.restore(semantic_map, info.stamp_ns, info.camera_poses).result()
-        logger.info(f"resumed map '{name}': {semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances")
 
     def _forget_inputs(self) -> None:
         inputs = self._inputs
@@ -236,21 +200,21 @@ class MapperNode(ManagedNode):
             inputs.reset()
 
     def problems(self) -> list[str]:
-        """What is wrong, in words; nothing unless the node is active."""
-        watch = self._watch
-        return [problem.sentence for problem in watch.problems()] if watch is not None else []
+        """Return sentences that say what is wrong; none unless the node is active."""
+        monitor = self._monitor
+        return [problem.sentence for problem in monitor.problems()] if monitor is not None else []
 
     def _arrived(self, topic: str, stamp_ns: int) -> None:
-        watch = self._watch
-        if watch is not None:  # It comes a moment after the inputs that it watches.
-            watch.arrived(topic, stamp_ns)
+        monitor = self._monitor
+        if monitor is not None:  # It is made shortly after the inputs that it monitors.
+            monitor.arrived(topic, stamp_ns)
 
     def _log_line(self) -> tuple[str, dict[str, str]]:
-        """How it fares, and the problems by kind, for the log."""
+        """Return a line for the log on the state of mapping, and the problems by kind."""
         if self.session is None:
             return self.state, {}
-        watch = self._watch
-        return self.status(), {each.kind: each.sentence for each in (watch.problems() if watch is not None else [])}
+        monitor = self._monitor
+        return self.status(), {each.kind: each.sentence for each in (monitor.problems() if monitor is not None else [])}
 
     def _read_config(self) -> Config:
         return self.config
@@ -268,70 +232,17 @@ class MapperNode(ManagedNode):
 
 
 def main(args: Sequence[str] | None = None, make_pipeline: Callable[[Config], Pipeline] = Pipeline.from_config) -> int:
-    """Run the node until SIGINT or SIGTERM, in a process of its own.
+    """Run the node in this process until SIGINT or SIGTERM.
 
-    A map that is saved by period is saved a last time then, unless that takes longer than ``node.service_timeout_s`` or
-    there is another signal.
-
-    With ``node.autostart`` it is brought to map at once; otherwise it waits, unconfigured, for a lifecycle manager.
+    A map that is saved periodically is then saved a last time, unless that takes longer than ``node.service_timeout_s`` or
+    another signal comes. With ``node.autostart`` the node starts to map by itself; otherwise it waits, unconfigured, for a
+    lifecycle manager.
 
     Args:
-        args: Arguments without the program's name, ``--ros-args ...``; those of the process by default.
-        make_pipeline: As for :class:`MapperNode`.
-
-    Returns:
-        Exit code: 0 after a signal, 1 after a refusal, which is one line on stderr.
+        args: See :func:`run_node`, also for the exit code that is returned.
+        make_pipeline: See :class:`MapperNode`.
     """
-    arguments = list(sys.argv[1:] if args is None else args)
-    signals = StopSignals()
-    code = 0
-    node, executor = None, None
-    try:
-        # Without rclpy's handlers, which would pull the context from under callbacks in work.
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        stray = remove_ros_args(arguments)
-        if stray:
-            raise ConfigError(f"unknown arguments: {' '.join(stray)}; ROS arguments follow --ros-args")
-        node = MapperNode(make_pipeline)
-        executor = CallbackExecutor()
-        executor.add_node(node)
-        # Python runs signal handlers in the main thread alone, and not while that waits inside the middleware.
-        spinning = ThreadPoolExecutor(1, "spin").submit(executor.spin_on, node.get_logger().error)
-        if node.config.node.autostart:
-            # While it spins: a manager or an operator can see the state while the models load.
-            node.bring_up()
-        spinning.result()
-    except KeyboardInterrupt:
-        pass
-    except REFUSALS as error:
-        print(f"{NODE_NAME}: {one_line(error)}", file=sys.stderr)
-        code = 1
-    except Exception:
-        traceback.print_exc()
-        code = 1
-    _shut_down(node, executor, signals, code)
-    return code
-
-
-def _shut_down(node: MapperNode | None, executor: CallbackExecutor | None, signals: StopSignals, code: int) -> None:
-    """Take everything down within two seconds, but for a last save where that is due."""
-    signals.hold()
-    unfinished = []
-    if executor is not None and not executor.shutdown(_STOP_TIMEOUT_S / 2):
-        unfinished.append("call")
-    if node is not None:
-        if not node.stop(_STOP_TIMEOUT_S):
-            unfinished.append("frame")
-        if not node.save_last(lambda: signals.hurried):
-            unfinished.append("save")
-        node.destroy_node()
-    rclpy.try_shutdown()
-    if unfinished:
-        print(f"{NODE_NAME}: ending in the middle of a {' and a '.join(unfinished)}", file=sys.stderr)
-        # The interpreter's own end would wait for native code that is in work, or crash it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+    return run_node(NODE_NAME, lambda: MapperNode(make_pipeline), args)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Publishes a recording on its own topics, with ``/clock``."""
+"""The player node: publishes a recording on its topics, with ``/clock``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from rosgraph_msgs.msg import Clock
@@ -26,6 +25,7 @@ from fus3dmaps_core.errors import RecordingError
 from fus3dmaps_core.recordings.reader import RecordingReader
 from fus3dmaps_core.recordings.recorded_files import RawMessage
 from fus3dmaps_ros.node.refusals import REFUSALS
+from fus3dmaps_ros.topics.qos import named_qos
 from fus3dmaps_ros.topics.transport import enlarge_shared_memory
 
 NODE_NAME = "fus3dmaps_player"
@@ -39,33 +39,33 @@ _LINGER_S = 0.3
 
 
 class Player(Node):
-    """Publishes the raw messages of a recording, paced by their times of recording."""
+    """Publishes the raw messages of a recording at the pace at which they were recorded."""
 
     def __init__(self, recording: RecordingReader, **options: Any) -> None:
-        """Advertise the recording's topics; those of unknown message types are left out with a warning.
+        """Advertise the recording's topics; leave out those of unknown message types with a warning.
 
         Args:
-            recording: What to play.
-            options: For ``rclpy.node.Node``, e.g. ``context``.
+            recording: The recording to play.
+            options: Options of ``rclpy.node.Node``, e.g. ``context``.
 
         Raises:
-            RecordingError: No topic is of a known type.
+            RecordingError: No topic has a known type.
         """
         super().__init__(NODE_NAME, **options)
         self._recording = recording
-        self._clock_outlet = self.create_publisher(Clock, "/clock", _qos(depth=10))
+        self._clock_outlet = self.create_publisher(Clock, "/clock", named_qos("reliable", 10))
         self._outlets: dict[str, Publisher] = {}
         for topic, summary in recording.topics.items():
             message_type = _message_type(summary.msgtype)
             if message_type is None:
                 self.get_logger().warning(f"{topic} is not played: message type {summary.msgtype} is not installed")
             elif topic != "/clock":
-                self._outlets[topic] = self.create_publisher(message_type, topic, _qos(depth=20))
+                self._outlets[topic] = self.create_publisher(message_type, topic, named_qos("reliable", 20))
         if not self._outlets:
             raise RecordingError(f"recording '{recording.path}' has no topic of an installed message type")
 
     def wait_for_subscribers(self, timeout_s: float) -> None:
-        """Wait until every topic has a subscriber, or some have and no more come for a second.
+        """Wait until every topic has a subscriber, or until some have one and no more appear for a second.
 
         Raises:
             RecordingError: Nobody subscribed to anything within the time.
@@ -87,7 +87,7 @@ class Player(Node):
             self.get_logger().info(f"nobody listens on {', '.join(unheard)}")
 
     def play(self, rate: float) -> None:
-        """Publish everything, with the clock at every message and at 100 Hz of wall time between them.
+        """Publish everything; the clock ticks at every message, and at 100 Hz of wall time between messages.
 
         Args:
             rate: Speed; 0 plays as fast as messages are read and reliable subscribers acknowledge them.
@@ -114,7 +114,7 @@ class Player(Node):
         self.get_logger().info(f"played {published} messages in {wall_s:.1f} s (rate {achieved:.2f})")
 
     def drain(self) -> None:
-        """Wait until reliable subscribers have everything."""
+        """Wait until reliable subscribers have received everything."""
         deadline = time.monotonic() + _DRAIN_TIMEOUT_S
         for topic, outlet in self._outlets.items():
             left_s = max(deadline - time.monotonic(), 0.0)
@@ -123,7 +123,7 @@ class Player(Node):
         time.sleep(_LINGER_S)
 
     def _paced(self, rate: float, started: float) -> Iterator[RawMessage]:
-        """The messages, each once its time has come."""
+        """Yield each message at its time."""
         start_ns = self._recording.start_ns
         for message in self._recording.messages(self._outlets.keys()):
             if rate > 0:
@@ -141,12 +141,12 @@ class Player(Node):
 
 
 def play(bag: Path, *, rate: float = 1.0, wait_for_subscribers_s: float = 60.0, ros_arguments: Sequence[str] = ()) -> int:
-    """Play a recording through DDS, in a process of its own.
+    """Play a recording through DDS; meant for a process of its own.
 
     Args:
         bag: rosbag2 directory or .mcap or .db3 file.
         rate: Speed; 0 plays as fast as messages are read and taken.
-        wait_for_subscribers_s: Longest wait for a first subscriber; 0 starts at once.
+        wait_for_subscribers_s: Longest wait for a first subscriber, seconds; 0 starts at once.
         ros_arguments: ``--ros-args ...``, e.g. to remap topics.
 
     Returns:
@@ -179,7 +179,7 @@ def play(bag: Path, *, rate: float = 1.0, wait_for_subscribers_s: float = 60.0, 
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """The ``player`` executable; see :func:`play`."""
+    """Run the ``player`` executable; see :func:`play`."""
     parser = argparse.ArgumentParser(prog="player", description="Publish a recording on its topics, with /clock.")
     parser.add_argument("bag", type=Path, help="rosbag2 directory or .mcap or .db3 file")
     parser.add_argument("--rate", type=float, default=1.0, help="speed; 0 plays as fast as it is taken")
@@ -189,17 +189,8 @@ def main(args: Sequence[str] | None = None) -> int:
     return play(options.bag, rate=options.rate, wait_for_subscribers_s=options.wait, ros_arguments=arguments)
 
 
-def _qos(depth: int) -> QoSProfile:
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
-
-
 def _message_type(name: str) -> Any:
-    """The class of ``package/msg/Name``, or None where its package is not installed."""
+    """Return the class of ``package/msg/Name``, or None if its package is not installed."""
     package, _, kind = name.partition("/msg/")
     try:
         return getattr(import_module(f"{package}.msg"), kind, None)

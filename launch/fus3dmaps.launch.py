@@ -29,7 +29,7 @@ SHOWN = ("map", "labels", "similarity", "instances", "answer", "detections", "pa
 
 
 def generate_launch_description():
-    """Declare the arguments; the nodes follow from their values."""
+    """Declare the arguments, whose values decide on the nodes."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(

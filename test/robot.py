@@ -25,8 +25,7 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_ros.mapper_node import MapperNode
 from fus3dmaps_ros.node.executor import CallbackExecutor
-from fus3dmaps_ros.topics.inputs import input_qos
-from fus3dmaps_ros.topics.outputs import LATCHED
+from fus3dmaps_ros.topics.qos import LATCHED, named_qos
 
 TIMEOUT_S = 60.0
 RELIABLE_INPUTS = {f"input.{stream}_qos": "reliable" for stream in ("rgb", "depth", "camera_info", "pose")}
@@ -157,7 +156,7 @@ class Robot:
         self.user = Node("user", context=self.context, namespace=self.namespace)
         self._threads = CallbackThreads(self.context, self.mapper, self.user)
         self._threads.__enter__()
-        qos = input_qos("reliable", 100)
+        qos = named_qos("reliable", 100)
         source = parameters.get("input.pose_source", "pose")
         outlets: dict[str, tuple[Any, str, Any]] = {}
         if source in POSES:

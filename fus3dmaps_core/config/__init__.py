@@ -1,1 +1,1 @@
-"""Parameters: one schema, with units, ranges and words."""
+"""The parameters: one schema with defaults, units, ranges and descriptions."""

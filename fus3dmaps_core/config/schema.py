@@ -1,7 +1,8 @@
 """The one configuration schema: defaults, units, ranges and descriptions.
 
 The dotted keys of :class:`Config` (``map.voxel_size_m``) are the ROS parameters, the keys of the YAML files and what the
-command line's ``--set`` takes. Defaults are the paper's [sec: Parameter Overview] wherever it states one.
+command line's ``--set`` takes. Defaults are the paper's [sec: Parameter Overview] wherever it states one. A running node
+takes another value of a ``Changeable`` parameter at any time, of a ``Fixed`` one never, of all others while unconfigured.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from pydantic import BaseModel, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from fus3dmaps_core.config.input import InputConfig
-from fus3dmaps_core.config.section import Section
+from fus3dmaps_core.config.section import Changeable, Fixed, Section
 from fus3dmaps_core.errors import ConfigError
 
 Runtime = Literal["torch", "compile", "onnxruntime", "tensorrt"]
@@ -63,11 +64,13 @@ class SegmenterConfig(Section):
         "",
         description="Weights of the segmenter: a file, a directory or a repository, as encoder.weights. Empty: published.",
     )
-    min_area_px: int = Field(400, ge=1, description="Masks with fewer pixels (at the working resolution) are dropped.")
-    max_border_contact: float = Field(
+    min_area_px: Changeable[int] = Field(
+        400, ge=1, description="Masks with fewer pixels (at the working resolution) are dropped."
+    )
+    max_border_contact: Changeable[float] = Field(
         0.2, ge=0.0, le=1.0, description="Masks with a larger share of their contour on the image border are dropped."
     )
-    max_masks: int = Field(64, ge=1, description="At most this many masks of a frame are used, largest first.")
+    max_masks: Changeable[int] = Field(64, ge=1, description="At most this many masks of a frame are used, largest first.")
     crop_padding: float = Field(
         0.05, ge=0.0, le=1.0, description="Padding around a mask's bounding box, as a share of its size."
     )
@@ -86,10 +89,12 @@ class ImageConfig(Section):
 class KeyframeConfig(Section):
     """Motion since the last keyframe that makes the next one; either threshold suffices."""
 
-    dense_translation_m: float = Field(0.08, ge=0.0, description="Translation for a dense keyframe, metres.")
-    dense_rotation_rad: float = Field(0.06, ge=0.0, description="Rotation for a dense keyframe, radians.")
-    instance_translation_m: float = Field(0.14, ge=0.0, description="Translation for an instance keyframe, metres.")
-    instance_rotation_rad: float = Field(0.11, ge=0.0, description="Rotation for an instance keyframe, radians.")
+    dense_translation_m: Changeable[float] = Field(0.08, ge=0.0, description="Translation for a dense keyframe, metres.")
+    dense_rotation_rad: Changeable[float] = Field(0.06, ge=0.0, description="Rotation for a dense keyframe, radians.")
+    instance_translation_m: Changeable[float] = Field(
+        0.14, ge=0.0, description="Translation for an instance keyframe, metres."
+    )
+    instance_rotation_rad: Changeable[float] = Field(0.11, ge=0.0, description="Rotation for an instance keyframe, radians.")
 
 
 class SamplingConfig(Section):
@@ -127,7 +132,7 @@ class MapConfig(Section):
     backend: Literal["auto", "compiled", "torch"] = Field(
         "auto", description="Inner loops: compiled (CPU only), torch (any device), or auto: compiled where they run."
     )
-    memory_budget_mib: float = Field(
+    memory_budget_mib: Changeable[float] = Field(
         0.0,
         ge=0.0,
         description="What the map may take on its device, host or GPU alike, MiB; near it the window shrinks and the least"
@@ -144,7 +149,9 @@ class FusionConfig(Section):
     window_radius_m: float = Field(
         0.0, ge=0.0, description="Radius of the sliding window of the dense layer, metres; 0 keeps the whole dense layer."
     )
-    period_frames: int = Field(5, ge=1, description="With a sliding window, fuse after every n-th processed frame.")
+    period_frames: Changeable[int] = Field(
+        5, ge=1, description="With a sliding window, fuse after every n-th processed frame."
+    )
     keep_most_evidence: bool = Field(
         True,
         description="With a sliding window, replace an object's fused embedding only by one of more evidence; false replaces"
@@ -155,27 +162,27 @@ class FusionConfig(Section):
 class QueryConfig(Section):
     """Answers to queries."""
 
-    top_k: int = Field(5, ge=1, description="Instances returned where a query does not say how many.")
-    min_voxels: int = Field(4, ge=1, description="Instances with fewer voxels are not ranked.")
+    top_k: Changeable[int] = Field(5, ge=1, description="Instances returned where a query does not say how many.")
+    min_voxels: Changeable[int] = Field(4, ge=1, description="Instances with fewer voxels are not ranked.")
 
 
 class NodeConfig(Section):
     """The ROS node."""
 
     queue_size: int = Field(4, ge=1, description="Frames that wait for the worker; the oldest is dropped when full.")
-    publish_period_s: float = Field(
+    publish_period_s: Changeable[float] = Field(
         2.0, gt=0.0, description="Period of ~/map, ~/instances and ~/path while someone subscribes, seconds."
     )
-    status_period_s: float = Field(1.0, gt=0.0, description="Period of ~/status, seconds.")
-    service_timeout_s: float = Field(
+    status_period_s: Changeable[float] = Field(1.0, gt=0.0, description="Period of ~/status, seconds.")
+    service_timeout_s: Changeable[float] = Field(
         30.0, gt=0.0, description="Longest time that a service takes before it replies that it was not done, seconds."
     )
-    map_directory: str = Field("~/.ros/fus3dmaps", min_length=1, description="Directory that holds saved maps.")
-    autosave_period_s: float = Field(
+    map_directory: Changeable[str] = Field("~/.ros/fus3dmaps", min_length=1, description="Directory that holds saved maps.")
+    autosave_period_s: Changeable[float] = Field(
         0.0, ge=0.0, description="Period of saving a map that has changed into node.map_directory, seconds; 0: never."
     )
     resume: bool = Field(False, description="Start with the newest good map of node.map_directory, where there is one.")
-    autostart: bool = Field(
+    autostart: Fixed[bool] = Field(
         True, description="Load the models and map at once; false leaves both to a manager of lifecycle nodes."
     )
 
@@ -235,11 +242,11 @@ class Config(Section):
             raise ConfigError(f"{path}: {error}") from None
 
     def flat(self) -> dict[str, Any]:
-        """Every value under its dotted key, in the order of the schema."""
+        """Return every value under its dotted key, in the order of the schema."""
         return dict(_flatten(self.model_dump()))
 
     def with_values(self, values: Mapping[str, Any]) -> Config:
-        """A copy in which the given dotted keys are replaced.
+        """Return a copy in which the values of the given dotted keys are replaced.
 
         Raises:
             ConfigError: As :meth:`from_flat`.
@@ -263,7 +270,7 @@ def _describe(error: ValidationError) -> str:
 
 
 def fields() -> dict[str, FieldInfo]:
-    """The schema's fields (default, description, bounds) under their dotted keys, in order."""
+    """Return the schema's fields (default, description, bounds) under their dotted keys, in order."""
     return dict(_FIELDS)
 
 

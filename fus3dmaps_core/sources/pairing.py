@@ -10,6 +10,7 @@ from typing import Any
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages.fields import to_pose
 from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
@@ -71,12 +72,12 @@ class FramePairer:
         ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without losing a frame:
         ``time_jump``, ``intrinsics_changed``, ``frame_id_changed``.
         """
-        return self._tally.drops
+        return self._tally.drops.counts()
 
     @property
     def last_drop(self) -> dict[str, str]:
         """Explanation of the latest drop of each reason; it names the topic."""
-        return self._tally.last_drop
+        return self._tally.drops.latest()
 
     def streams(self) -> list[Stream]:
         """List every topic to listen to except TF: those of the cameras, then the poses."""
@@ -130,6 +131,10 @@ class FramePairer:
     def drop(self, error: FrameError) -> None:
         """Count a message that cannot be used."""
         self._tally.drop(error)
+
+    def hand_over_drops(self, drops: Drops) -> None:
+        """Move the counts of :attr:`drops` to another count: each reason once, with its number and latest explanation."""
+        self._tally.drops.pour_into(drops)
 
     def _start_anew(self) -> None:
         for camera in self._cameras:

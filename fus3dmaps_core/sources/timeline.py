@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages import fields
 
 _TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours. Only another clock or a restart goes back this far.
@@ -19,16 +19,13 @@ class Tally:
 
     Attributes:
         drops: Messages that led to no frame, and events worth noting, by reason.
-        last_drop: Explanation of the latest drop of each reason; it names the topic.
     """
 
-    drops: Counter[str] = field(default_factory=Counter)
-    last_drop: dict[str, str] = field(default_factory=dict)
+    drops: Drops = field(default_factory=Drops)
 
     def drop(self, error: FrameError) -> None:
         """Count a message that cannot be used."""
-        self.drops[error.reason] += 1
-        self.last_drop[error.reason] = str(error)
+        self.drops.add(error.reason, str(error))
 
 
 class Timeline:

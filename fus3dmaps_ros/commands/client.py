@@ -1,4 +1,4 @@
-"""A client of the mapper node: asks it in words and collects what a picture of the answer needs."""
+"""A client of the mapper node: asks questions and collects what a picture of the answer needs."""
 
 from __future__ import annotations
 
@@ -14,23 +14,21 @@ from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import Image, PointCloud2
+from sensor_msgs.msg import PointCloud2
 
 from fus3dmaps_core.answers.query import RankedInstance
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.messages.fields import stamp_ns, to_pose
-from fus3dmaps_msgs.srv import LoadMap, QueryImage, QueryText, SaveMap
-from fus3dmaps_ros.topics.conversions import from_cloud, unpack_rgb
-
-_LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+from fus3dmaps_msgs.srv import QueryText
+from fus3dmaps_ros.topics.conversions import cloud_points, from_cloud, from_instance, unpack_rgb
+from fus3dmaps_ros.topics.qos import LATCHED
 
 
 class MapperClient:
     """Talks to one mapper node, in a ROS context of its own. Use it as a context manager."""
 
     def __init__(self, node_name: str = "/fus3dmaps") -> None:
-        """Connect to the node of this fully qualified name."""
+        """Connect to the node with this fully qualified name."""
         self._name = node_name
         self._context = Context()
         rclpy.init(context=self._context)
@@ -69,63 +67,23 @@ class MapperClient:
         publish: bool = False,
         timeout_s: float = 60.0,
     ) -> QueryText.Response:
-        """Ask for prompts.
+        """Ask where the things are that prompts name.
 
         Raises:
             QueryError: The node refuses, with its own words, or does not answer in time.
         """
-        request = QueryText.Request(prompts=list(prompts), **_options(negative_prompts, layer, threshold, top_k, publish))
-        return self._call(self._query, request, timeout_s)
-
-    def ask_image(
-        self,
-        image: Image,
-        *,
-        negative_prompts: Sequence[str] = (),
-        layer: str = "",
-        threshold: float = 0.0,
-        top_k: int = 0,
-        publish: bool = False,
-        timeout_s: float = 60.0,
-    ) -> QueryImage.Response:
-        """Ask for the thing that fills an image.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        request = QueryImage.Request(image=image, **_options(negative_prompts, layer, threshold, top_k, publish))
-        return self._call_once(QueryImage, "query_image", request, timeout_s)
-
-    def save_map(self, name: str, timeout_s: float = 60.0) -> SaveMap.Response:
-        """Have the node save its map under a name.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        return self._call_once(SaveMap, "save_map", SaveMap.Request(name=name), timeout_s)
-
-    def load_map(self, name: str = "", timeout_s: float = 60.0) -> LoadMap.Response:
-        """Have the node go on from a saved map; without a name from the newest.
-
-        Raises:
-            QueryError: The node refuses, with its own words, or does not answer in time.
-        """
-        return self._call_once(LoadMap, "load_map", LoadMap.Request(name=name), timeout_s)
-
-    def _call_once(self, service_type: Any, name: str, request: Any, timeout_s: float) -> Any:
-        client = self._node.create_client(service_type, f"{self._name}/{name}")
-        try:
-            if not client.wait_for_service(timeout_sec=timeout_s):
-                raise QueryError(f"no node '{self._name}' answers on {self._name}/{name} within {timeout_s:.0f} s")
-            return self._call(client, request, timeout_s)
-        finally:
-            self._node.destroy_client(client)
-
-    def _call(self, client: Any, request: Any, timeout_s: float) -> Any:
-        future = client.call_async(request)
+        request = QueryText.Request(
+            prompts=list(prompts),
+            negative_prompts=list(negative_prompts),
+            layer=layer,
+            threshold=threshold,
+            top_k=top_k,
+            publish=publish,
+        )
+        future = self._query.call_async(request)
         self._executor.spin_until_future_complete(future, timeout_sec=timeout_s)
         if not future.done():
-            client.remove_pending_request(future)
+            self._query.remove_pending_request(future)
             raise QueryError(f"node '{self._name}' did not answer within {timeout_s:.0f} s")
         response = future.result()
         if not response.success:
@@ -133,23 +91,23 @@ class MapperClient:
         return response
 
     def map_cloud(self, since_ns: int = 0, timeout_s: float = 30.0) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """The node's map: voxel centres (n, 3) in metres and their colours (n, 3).
+        """Return the node's map: voxel centres (n, 3) in metres and their colours (n, 3).
 
         Args:
-            since_ns: Oldest stamp that will do; the node first hands out the last map that anyone listened to.
+            since_ns: Oldest stamp that is accepted; the node first sends the map that it published last.
             timeout_s: Longest wait.
 
         Raises:
             QueryError: None is published in time.
         """
         table = from_cloud(self._receive(PointCloud2, "map", since_ns, timeout_s))
-        return np.stack([table[axis] for axis in "xyz"], axis=1), unpack_rgb(table["rgb"])
+        return cloud_points(table), unpack_rgb(table["rgb"])
 
     def camera_poses(self, since_ns: int = 0, timeout_s: float = 30.0) -> NDArray[np.float64]:
-        """Poses T_world_camera (n, 4, 4) of the node's keyframes.
+        """Return the poses T_world_camera (n, 4, 4) of the node's keyframes.
 
         Args:
-            since_ns: Oldest stamp that will do.
+            since_ns: Oldest stamp that is accepted.
             timeout_s: Longest wait.
 
         Raises:
@@ -159,9 +117,9 @@ class MapperClient:
         return np.array([to_pose(pose, "path") for pose in message.poses]).reshape(-1, 4, 4)
 
     def _receive(self, message_type: Any, topic: str, since_ns: int, timeout_s: float) -> Any:
-        """A message of one of the node's latched topics."""
+        """Receive a message of one of the node's latched topics."""
         received: list[Any] = []
-        subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, _LATCHED)
+        subscription = self._node.create_subscription(message_type, f"{self._name}/{topic}", received.append, LATCHED)
         deadline = time.monotonic() + timeout_s
         try:
             while time.monotonic() < deadline:
@@ -173,41 +131,14 @@ class MapperClient:
         raise QueryError(f"nothing new is published on {self._name}/{topic} within {timeout_s:.0f} s")
 
 
-def _options(negative_prompts: Sequence[str], layer: str, threshold: float, top_k: int, publish: bool) -> dict[str, Any]:
-    """The fields that questions by text and by image share."""
-    return {
-        "negative_prompts": list(negative_prompts),
-        "layer": layer,
-        "threshold": threshold,
-        "top_k": top_k,
-        "publish": publish,
-    }
-
-
-def ranked_instances(response: QueryText.Response | QueryImage.Response) -> list[RankedInstance]:
-    """The instances of a reply, best first."""
-    return [
-        RankedInstance(
-            id=found.id,
-            prompt=found.prompt,
-            score=found.score,
-            weight=found.weight,
-            centroid_m=_position(found.centroid),
-            box_min_m=_position(found.box_min),
-            box_max_m=_position(found.box_max),
-            voxels=found.voxels,
-        )
-        for found in response.instances
-    ]
-
-
-def _position(point: Any) -> NDArray[np.float32]:
-    return np.array([point.x, point.y, point.z], np.float32)
+def ranked_instances(response: QueryText.Response) -> list[RankedInstance]:
+    """Return the instances of a reply, best first."""
+    return [from_instance(found) for found in response.instances]
 
 
 def similarity_points(
-    response: QueryText.Response | QueryImage.Response,
+    response: QueryText.Response,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
+    """Return the similarity cloud of a reply: points (n, 3) in metres and similarities (n,)."""
     table = from_cloud(response.similarity)
-    return np.stack([table[axis] for axis in "xyz"], axis=1), np.array(table["similarity"])
+    return cloud_points(table), np.array(table["similarity"])

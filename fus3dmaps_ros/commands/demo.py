@@ -1,7 +1,7 @@
-"""The demonstration: a recording is played through DDS into a mapper node, which is then asked for things in words.
+"""``fus3dmaps demo``: a recording is played through DDS into a mapper node, which is then asked for things in words.
 
-Node and player are two processes of their own, as on a robot. Without a recording the furnished room is recorded first; its
-ground truth then tells whether each answer is right.
+Node and player are two processes, as on a robot. Without a recording the furnished room is recorded first; its ground truth
+then tells whether each answer is right.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ ROOM_PROMPTS = {
     "a drink that wakes you up": "coffee",
     "a two-wheeled vehicle with an engine": "motorcycle",
 }
-"""What the room is asked for, and the object that is meant. None is a class name of the networks."""
+"""Prompts for the room and the object that each means. None of the prompts is a class name of the networks."""
 
 RECORDING_PROMPTS = ("something to drink from", "a place to sit", "a display that shows pictures")
-"""What a recording of the user's is asked for if nothing else is said."""
+"""Prompts for the user's recording if the user gives none."""
 
 NODE_PARAMETERS: dict[str, str] = {}
-"""Parameters of the node beside those that the demonstration itself needs."""
+"""Parameters of the node besides those that the demonstration itself needs."""
 
 _MODELS_TIMEOUT_S = 180.0
-_PATIENCE_S = 20.0  # Without a newer frame in the map for so long after the last was played, the node has done all it will.
+_PATIENCE_S = 20.0  # If no newer frame is in the map this long after the last was played, the node has finished.
 
 
 def run_demo(recording: Path | None, prompts: Sequence[str], out: Path, console: Console) -> bool:
@@ -53,7 +53,7 @@ def run_demo(recording: Path | None, prompts: Sequence[str], out: Path, console:
         recording: rosbag2 directory or MCAP file; None records the furnished room.
         prompts: What to ask; empty takes the defaults.
         out: Directory, made if missing.
-        console: Where to tell what happens.
+        console: Shows what happens.
 
     Returns:
         Whether every answer was right, as far as that is known.
@@ -113,7 +113,7 @@ def _topic(reader: RecordingReader, name: str) -> str:
 
 @contextmanager
 def _process(name: str, command: Sequence[str], log: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    """A child process that logs to a file and is interrupted, as by Ctrl-C, when the block is left."""
+    """Start a child process that logs to a file; when the block is left, interrupt it as Ctrl-C does."""
     with log.open("wb") as file:
         process = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT, env=environment, start_new_session=True)
     try:
@@ -220,7 +220,7 @@ def _place(instance: RankedInstance) -> str:
 
 
 def _is_object(instance: RankedInstance, room: FurnishedRoom, name: str) -> bool:
-    """Whether the answer's centroid lies in the object, give or take the voxels that noise adds around it."""
+    """Return whether the answer's centroid lies in the object, with a margin for the voxels that noise adds around it."""
     (target,) = (candidate for candidate in room.objects if candidate.name == name)
     margin_m = 0.1
     centroid = np.asarray(instance.centroid_m, np.float64)

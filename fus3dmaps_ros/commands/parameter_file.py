@@ -8,22 +8,15 @@ from __future__ import annotations
 import json
 from typing import Any
 
-import annotated_types
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from fus3dmaps_core.config.schema import Config, fields
-
-_SIGNS = {
-    annotated_types.Ge: (">=", "ge"),
-    annotated_types.Gt: (">", "gt"),
-    annotated_types.Le: ("<=", "le"),
-    annotated_types.Lt: ("<", "lt"),
-}
+from fus3dmaps_core.config.section import bounds, choices
 
 
 def yaml_with_comments(config: Config) -> str:
-    """A ROS parameter file with every value of a configuration, each under its description and bounds."""
+    """Return a ROS parameter file with every value of a configuration, each under its description and bounds."""
     lines = ["# Parameters of the fus3dmaps node. All of them, with their default values.", "/**:", "  ros__parameters:"]
     values, described = config.flat(), fields()
     for section, holder in Config.model_fields.items():
@@ -32,22 +25,18 @@ def yaml_with_comments(config: Config) -> str:
         lines += ["", f"    # {(type(holder.default).__doc__ or '').strip()}", f"    {section}:"]
         for name in type(holder.default).model_fields:
             key = f"{section}.{name}"
-            bounds = _bounds(described[key])
-            lines.append(f"      # {described[key].description}" + (f" [{bounds}]" if bounds else ""))
+            allowed = _bounds(described[key])
+            lines.append(f"      # {described[key].description}" + (f" [{allowed}]" if allowed else ""))
             lines.append(f"      {name}: {_scalar(values[key])}")
     return "\n".join(lines) + "\n"
 
 
 def _bounds(field: FieldInfo) -> str:
-    choices = getattr(field.annotation, "__args__", ())
-    if choices and all(isinstance(choice, str) for choice in choices):
-        return " | ".join(choices)
-    signs = [(_SIGNS[type(bound)], bound) for bound in field.metadata if type(bound) in _SIGNS]
-    return ", ".join(f"{sign} {getattr(bound, name)}" for (sign, name), bound in signs)
+    return " | ".join(choices(field)) or ", ".join(f"{sign} {limit}" for sign, limit in bounds(field).items())
 
 
 def _scalar(value: Any) -> str:
-    """JSON is YAML, and keeps the decimal point by which ROS tells a double from an integer."""
+    """Return a value as JSON, which is YAML and keeps the decimal point by which ROS tells a double from an integer."""
     return json.dumps(value, ensure_ascii=False)
 
 

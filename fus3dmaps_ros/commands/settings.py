@@ -1,4 +1,4 @@
-"""What the command line says about parameters and directories: ``--params-file``, ``--set``, ``--option`` and ``--out``."""
+"""Options that several commands share, and how the texts of ``--set``, ``--option`` and ``--out`` are read."""
 
 from __future__ import annotations
 
@@ -14,14 +14,18 @@ from fus3dmaps_core.errors import ConfigError
 ParamsFile = Annotated[Path | None, typer.Option("--params-file", help="YAML file of parameters, as for the node.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", help="A parameter, e.g. map.voxel_size_m=0.1; repeatable.")]
 DatasetOptions = Annotated[list[str] | None, typer.Option("--option", help="Of the dataset, e.g. stride=11; repeatable.")]
+Prompts = Annotated[list[str], typer.Argument(metavar="PROMPT...", help="What to look for, in plain words.")]
+Layer = Annotated[str, typer.Option("--layer", help="dense, fused_dense, instances or fused_instances.")]
+Negative = Annotated[list[str] | None, typer.Option("--not", help="What it is not; repeatable.")]
+AnswerAsJson = Annotated[bool, typer.Option("--json", help="Print a JSON list, best first.")]
 
 
 def configuration(params_file: Path | None, settings: list[str] | None) -> Config:
-    """The parameters of a file, or the defaults, with those of ``--set`` in their place.
+    """Return the parameters of a file, or the defaults, after ``--set`` has replaced some of them.
 
     Args:
-        params_file: As :meth:`fus3dmaps_core.config.schema.Config.from_yaml` reads it.
-        settings: ``key=value`` each. A text is taken as it stands, empty too, unless it is in quotes; all else is YAML.
+        params_file: A file that :meth:`fus3dmaps_core.config.schema.Config.from_yaml` can read.
+        settings: ``key=value`` each. Text is taken literally, even if empty, unless it is in quotes; all else is YAML.
 
     Raises:
         ConfigError: The file cannot be read, or a parameter is unknown, of the wrong type or out of range.
@@ -31,10 +35,10 @@ def configuration(params_file: Path | None, settings: list[str] | None) -> Confi
 
 
 def pairs(option: str, settings: list[str] | None) -> dict[str, str]:
-    """The texts of a repeatable option by their keys.
+    """Return the texts of a repeatable option by their keys.
 
     Args:
-        option: Its name, for the message.
+        option: The option's name, for the message.
         settings: ``key=value`` each.
 
     Raises:
@@ -50,10 +54,10 @@ def pairs(option: str, settings: list[str] | None) -> dict[str, str]:
 
 
 def directory(text: str | Path) -> Path:
-    """The directory that ``--out`` names.
+    """Return the directory that ``--out`` names.
 
     Raises:
-        ConfigError: The text is empty, which as a path would be the current directory.
+        ConfigError: The text is empty; as a path it would be the current directory.
     """
     if not str(text).strip():
         raise ConfigError("--out: the name of a directory is missing; the current directory is '.'")
@@ -63,7 +67,7 @@ def directory(text: str | Path) -> Path:
 def _value(key: str, text: str) -> Any:
     field = fields().get(key)
     plain = text.strip()
-    # As YAML a path may be a number, a date, or end at a "#", and nothing at all is no text.
+    # Read as YAML, a path could be a number or a date, or end at a "#", and empty text would be null.
     if field is not None and isinstance(field.default, str) and not plain.startswith(("'", '"')):
         return plain
     try:

@@ -1,1 +1,1 @@
-"""What the node is made of: life cycle, threads, parameters, the session."""
+"""Parts of the node: life cycle, threads, parameters, and the session with models and map."""

@@ -1,4 +1,4 @@
-"""A managed node that survives what managers ask of it: transitions that are refused or fail are words in the log."""
+"""A managed node on which transitions that are refused or fail are logged and do not end the process."""
 
 from __future__ import annotations
 
@@ -16,33 +16,35 @@ from rclpy.node import Node
 from fus3dmaps_ros.node.refusals import REFUSALS, one_line
 
 UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
-"""Labels of the primary states between which a manager moves the node; the fourth is "finalized"."""
+"""Labels of the primary states between which a manager moves the node. The fourth is "finalized"."""
 
 
 class ManagedNode(LifecycleNodeMixin, Node):
-    """A lifecycle node whose transitions are written as plain methods that return, or raise why they cannot.
+    """A lifecycle node whose transitions are plain methods, which raise an exception if they fail.
 
-    Subclasses implement :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`. One that raises leaves
-    the node in the state that it was in; the reason is logged, and kept in ``failure``. States are told at once, also
-    while a transition takes long.
+    Subclasses implement :meth:`configure`, :meth:`activate`, :meth:`deactivate` and :meth:`cleanup`. After an exception the
+    node is in the state that it was in before; the reason is logged and kept in ``failure``. The state can be asked for at
+    any time, even during a long transition.
 
     Attributes:
-        failure: What the last transition failed with; None if it succeeded.
+        autostart: Whether the node is brought up when it starts, without a lifecycle manager.
+        failure: The exception of the last transition; None if it succeeded.
     """
 
     def __init__(self, name: str, **options: Any) -> None:
         """Start unconfigured.
 
         Args:
-            name: Of the node.
-            options: For ``rclpy.node.Node``.
+            name: The node's name.
+            options: Options of ``rclpy.node.Node``.
         """
+        self.autostart = False
         self.failure: Exception | None = None
         self._transition = threading.Lock()
         Node.__init__(self, name, **options)
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        # rclpy's own callback raises out of the executor when a transition is not possible now.
-        self._obey = self._service_change_state.callback
+        # The exceptions of rclpy's own callback, when a transition is not possible now, would end the executor.
+        self._change_state_of_rclpy = self._service_change_state.callback
         self._service_change_state.callback = self._change_state
 
     @property
@@ -54,54 +56,57 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """Configure and activate.
 
         Raises:
-            Exception: What one of them failed with; the node stays in the state that it had reached.
+            Exception: One of them failed; the node stays in the state that it had reached.
         """
         for trigger in (self.trigger_configure, self.trigger_activate):
             self._attempt(trigger)
 
-    def finalize(self) -> None:
-        """Go to the final state from any primary one; does nothing if it is reached already."""
-        if self.state in (UNCONFIGURED, INACTIVE, ACTIVE):
-            self._attempt(self.trigger_shutdown)
-
     def configure(self) -> None:
-        """Make ready, from unconfigured to inactive; what was made before a failure is taken back by :meth:`cleanup`."""
+        """Go from unconfigured to inactive; after a failure :meth:`cleanup` frees what was made so far."""
         raise NotImplementedError
 
     def activate(self) -> None:
-        """Begin to work, from inactive to active."""
+        """Go from inactive to active."""
         raise NotImplementedError
 
     def deactivate(self) -> None:
-        """Rest, from active to inactive; also undoes an activation that failed half-way."""
+        """Go from active to inactive; also undoes an activation that failed half-way."""
         raise NotImplementedError
 
     def cleanup(self) -> None:
-        """Give back what :meth:`configure` has made, however much of it there is."""
+        """Free what :meth:`configure` has made, even if it made only part of it."""
+        raise NotImplementedError
+
+    def stop(self, timeout_s: float) -> bool:
+        """Stop working, in any state, because the process ends; return whether that was done in time."""
+        raise NotImplementedError
+
+    def save_last(self, hurried: Callable[[], bool]) -> bool:
+        """Save what is due after :meth:`stop`, until ``hurried()`` is true; return whether no save is in progress."""
         raise NotImplementedError
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine."""
+        """Configure, for the state machine."""
         return self._run("configure", self.configure, self.cleanup)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine."""
+        """Activate, for the state machine."""
         return self._run("activate", self.activate, self.deactivate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine."""
+        """Deactivate, for the state machine."""
         return self._run("deactivate", self.deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine."""
+        """Clean up, for the state machine."""
         return self._run("cleanup", self.cleanup)
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine; from any primary state."""
+        """Deactivate and clean up, from any primary state, for the state machine."""
         return self._run("shutdown", self._give_back)
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Called by the state machine; leaves the node unconfigured, ready for another attempt."""
+        """Leave the node unconfigured, ready for another attempt, for the state machine."""
         return self._run("recovery", self._give_back)
 
     def _give_back(self) -> None:
@@ -114,7 +119,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         try:
             work()
         except Exception as error:
-            self.failure = self.failure or error  # What came first, not what its recovery met.
+            self.failure = self.failure or error  # The first one, not those of the recovery.
             self._report(name, error)
             if undo is not None:
                 try:
@@ -143,7 +148,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
             return response
         self.failure = None
         try:
-            return self._obey(request, response)
+            return self._change_state_of_rclpy(request, response)
         except rclpy_implementation.RCLError:
             self.get_logger().warning(f"transition '{asked}' refused: not possible from state '{self.state}'")
             return response

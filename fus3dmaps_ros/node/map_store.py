@@ -1,9 +1,10 @@
-"""Saving the map of a session and going on from a saved one."""
+"""Saving the map of a session, reading saved maps, and resuming from one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from fus3dmaps_core.errors import StorageError
 from fus3dmaps_core.saved_maps.directory import list_maps, map_path, map_root
@@ -14,28 +15,28 @@ from fus3dmaps_ros.node.session import Session
 
 
 def save_session(session: Session, root: str, name: str) -> tuple[Path, int]:
-    """Save the map as it stands; mapping goes on meanwhile.
+    """Save the map as it is now; mapping goes on meanwhile.
 
     Args:
-        session: Whose map.
+        session: Has the map.
         root: Directory of saved maps.
         name: The map's name in it.
 
     Returns:
-        Where it is, and its bytes on disk.
+        The map's path, and its size on disk in bytes.
 
     Raises:
-        StorageError: The name cannot be one, or the map cannot be written; a map that was there still is.
+        StorageError: The name is not allowed, or the map cannot be written; an earlier map of that name stays.
     """
     path = map_path(root, name)
     return path, save_map(path, session.pipeline)
 
 
 def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:
-    """Read a saved map into one like the session's, which goes on as it is.
+    """Read a saved map into a new one of the session's kind; the session's own map does not change.
 
     Raises:
-        StorageError: It is no map, damaged, or does not fit the session; the message names what differs.
+        StorageError: There is no map, it is damaged, or it does not fit the session; the message names what differs.
     """
     pipeline = session.pipeline
     fresh = pipeline.empty_map()
@@ -43,10 +44,10 @@ def read_map(session: Session, path: Path) -> tuple[SemanticMap, MapInfo]:
 
 
 def named_map(root: str, name: str) -> Path:
-    """Path of the map of a name, or without a name of the one that was saved last.
+    """Return the path of the map with this name, or without a name of the one that was saved last.
 
     Raises:
-        StorageError: There is no such map, or the name cannot be one.
+        StorageError: There is no such map, or the name is not allowed.
     """
     if name:
         return map_path(root, name)
@@ -56,17 +57,24 @@ def named_map(root: str, name: str) -> Path:
     return map_path(root, names[0])
 
 
-def read_newest(session: Session, root: str, warn: Callable[[str], object]) -> tuple[str, SemanticMap, MapInfo] | None:
-    """The newest saved map that is good.
+def resume_newest(session: Session, root: str, logger: Any) -> None:
+    """Go on from the newest good map among the saved ones; without one the session's map stays empty.
 
     Args:
-        session: What it must fit.
+        session: Gets the map, which must fit it.
         root: Directory of saved maps.
-        warn: Is told of each map that is passed over, and why.
-
-    Returns:
-        Its name, the map and what else is known of it; None where there is none.
+        logger: The node's logger; gets a line on this map, and on each that is skipped.
     """
+    found = _read_newest(session, root, logger.warning)
+    if found is None:
+        logger.info(f"no map to resume in '{root}'; starting with an empty one")
+        return
+    name, semantic_map, info = found
+    session.worker.restore(semantic_map, info.stamp_ns, info.camera_poses).result()
+    logger.info(f"resumed map '{name}': {semantic_map.voxel_count} voxels, {semantic_map.instance_count} instances")
+
+
+def _read_newest(session: Session, root: str, warn: Callable[[str], object]) -> tuple[str, SemanticMap, MapInfo] | None:
     try:
         names = list_maps(root)
     except StorageError as error:

@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import annotated_types
 from pydantic.fields import FieldInfo
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -15,33 +14,8 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fus3dmaps_core.config.schema import Config, fields
+from fus3dmaps_core.config.section import Changes, bounds, choices, when_it_changes
 from fus3dmaps_core.errors import ConfigError
-
-RUNTIME = frozenset(
-    {
-        "segmenter.min_area_px",
-        "segmenter.max_border_contact",
-        "segmenter.max_masks",
-        "keyframes.dense_translation_m",
-        "keyframes.dense_rotation_rad",
-        "keyframes.instance_translation_m",
-        "keyframes.instance_rotation_rad",
-        "map.memory_budget_mib",
-        "fusion.period_frames",
-        "query.top_k",
-        "query.min_voxels",
-        "node.publish_period_s",
-        "node.status_period_s",
-        "node.service_timeout_s",
-        "node.map_directory",
-        "node.autosave_period_s",
-    }
-)
-"""Keys that can be changed at any time. All others shape the models, the map or the graph, and can be changed while the node
-is unconfigured."""
-
-FIXED = frozenset({"node.autostart"})
-"""Keys that only matter at the start."""
 
 _TYPES = {
     bool: Parameter.Type.BOOL,
@@ -55,7 +29,7 @@ _INT64_MAX = 2**63 - 1
 
 
 def declare_parameters(node: Node) -> Config:
-    """Declare every key of the schema on a node and read the values it was started with.
+    """Declare every key of the schema on a node and read the values that it was started with.
 
     Raises:
         ConfigError: A value is of the wrong type or out of range; the message names the parameter.
@@ -63,7 +37,7 @@ def declare_parameters(node: Node) -> Config:
     values: dict[str, Any] = {}
     for key, field in fields().items():
         try:
-            value = node.declare_parameter(key, field.default, _descriptor(key, field)).value
+            value = node.declare_parameter(key, field.default, _descriptor(field)).value
         except InvalidParameterTypeException:
             given = node._parameter_overrides[key]
             raise ConfigError(
@@ -77,7 +51,7 @@ def declare_parameters(node: Node) -> Config:
 
 
 def unknown_overrides(node: Node) -> list[str]:
-    """A sentence for every parameter the node was given in one of the schema's sections but that the schema lacks."""
+    """Return a sentence for every given parameter that is in one of the schema's sections but not in the schema."""
     known = list(fields())
     sections = {key.partition(".")[0] for key in known}
     sentences = []
@@ -96,13 +70,13 @@ def follow_changes(
     apply: Callable[[Config], None],
     is_configured: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Check parameters that are set at run time against the schema and hand on the new configuration.
+    """Check parameters that are set at run time against the schema and apply the new configuration.
 
     Args:
-        node: Whose parameters to watch.
-        read: Gives the configuration in force.
+        node: Has the parameters.
+        read: Returns the current configuration.
         apply: Takes the new one.
-        is_configured: Whether the node has models and a map, which parameters outside of RUNTIME would not fit any more.
+        is_configured: Returns whether the node has models and a map; then only ``Changeable`` parameters can change.
     """
     known = fields()
 
@@ -115,8 +89,8 @@ def follow_changes(
             new, present = changed(parameters).flat(), read().flat()
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
-        for key in known:
-            if new[key] != present[key] and key not in RUNTIME and is_configured():
+        for key, field in known.items():
+            if new[key] != present[key] and when_it_changes(field) != Changes.ANY_TIME and is_configured():
                 return SetParametersResult(
                     successful=False,
                     reason=f"parameter '{key}' can be changed only while the node is unconfigured: deactivate and clean up"
@@ -128,44 +102,26 @@ def follow_changes(
     node.add_post_set_parameters_callback(lambda parameters: apply(changed(parameters)))
 
 
-def _descriptor(key: str, field: FieldInfo) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(description=field.description or "", read_only=key in FIXED)
-    lower: float | None = None
-    upper: float | None = None
-    exclusive = []
-    for bound in field.metadata:
-        match bound:
-            case annotated_types.Ge(ge=limit):
-                lower = limit  # type: ignore[assignment]
-            case annotated_types.Gt(gt=limit):
-                lower = limit  # type: ignore[assignment]
-                exclusive.append(f"> {limit}")
-            case annotated_types.Le(le=limit):
-                upper = limit  # type: ignore[assignment]
-            case annotated_types.Lt(lt=limit):
-                upper = limit  # type: ignore[assignment]
-                exclusive.append(f"< {limit}")
+def _descriptor(field: FieldInfo) -> ParameterDescriptor:
+    changes, limits, allowed = when_it_changes(field), bounds(field), choices(field)
+    descriptor = ParameterDescriptor(description=field.description or "", read_only=changes == Changes.NEVER)
     # ROS ranges are closed; the schema refuses the open end itself.
-    when = [] if key in RUNTIME | FIXED else ["changes only while the node is unconfigured"]
-    descriptor.additional_constraints = ", ".join([*_choices(field), *exclusive, *when])
-    if lower is None and upper is None:
-        return descriptor
-    if isinstance(field.default, int):
-        descriptor.integer_range = [
-            IntegerRange(
-                from_value=-_INT64_MAX if lower is None else int(lower), to_value=_INT64_MAX if upper is None else int(upper)
-            )
-        ]
-    elif isinstance(field.default, float):
-        largest = sys.float_info.max
-        descriptor.floating_point_range = [
-            FloatingPointRange(
-                from_value=-largest if lower is None else float(lower), to_value=largest if upper is None else float(upper)
-            )
-        ]
+    constraints = [f"{sign} {limit}" for sign, limit in limits.items() if sign in "><"]
+    if allowed:
+        constraints.insert(0, f"one of {', '.join(allowed)}")
+    if changes == Changes.UNCONFIGURED:
+        constraints.append("changes only while the node is unconfigured")
+    descriptor.additional_constraints = ", ".join(constraints)
+    lower, upper = limits.get(">=", limits.get(">")), limits.get("<=", limits.get("<"))
+    if limits and isinstance(field.default, int):
+        descriptor.integer_range = [_closed(IntegerRange, int, lower, upper, _INT64_MAX)]
+    elif limits and isinstance(field.default, float):
+        descriptor.floating_point_range = [_closed(FloatingPointRange, float, lower, upper, sys.float_info.max)]
     return descriptor
 
 
-def _choices(field: FieldInfo) -> list[str]:
-    values = getattr(field.annotation, "__args__", ())
-    return [f"one of {', '.join(values)}"] if values and all(isinstance(value, str) for value in values) else []
+def _closed(kind: Any, number: Callable[[Any], Any], lower: Any, upper: Any, largest: Any) -> Any:
+    """Make a ROS range; a bound that is None is as far away as the type allows."""
+    return kind(
+        from_value=-largest if lower is None else number(lower), to_value=largest if upper is None else number(upper)
+    )

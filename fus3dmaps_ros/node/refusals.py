@@ -1,4 +1,4 @@
-"""What a node is refused with: this package's own errors, and rclpy's for arguments and names that it cannot use."""
+"""Exceptions that refuse a request: this package's errors, and rclpy's for arguments and names that it cannot use."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ REFUSALS: tuple[type[Exception], ...] = (
     rclpy_implementation.RCLError,
     rclpy_implementation.UnknownROSArgsError,
 )
-"""To be shown as one line, not as a traceback."""
+"""Exceptions that are shown as one line, not as a traceback."""
 
 
 def one_line(error: Exception) -> str:
-    """The message of an error without line breaks, which those of the middleware have."""
+    """Return the message of an error without the line breaks that the middleware puts into its messages."""
     return " ".join(str(error).split())

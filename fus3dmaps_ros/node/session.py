@@ -1,4 +1,4 @@
-"""What the node has between configuration and clean-up: models, a map and the thread that feeds it."""
+"""The session: models, a map and the mapping thread, which the node has from configuration to clean-up."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from fus3dmaps_ros.node.worker import FrameWorker
 
 
 class SerialTextEncoder:
-    """A text encoder that several threads may call, one at a time: encoders need not be thread-safe.
+    """A text encoder for several threads: it lets one at a time into an encoder that need not be thread-safe.
 
     Attributes:
         space: Name of its trio.
     """
 
     def __init__(self, encoder: TextEncoder) -> None:
-        """Guard an encoder."""
+        """Wrap an encoder."""
         self._encoder, self.space = encoder, encoder.space
         self._lock = threading.Lock()
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
-        """As the encoder; waits for its turn."""
+        """Encode prompts as the wrapped encoder does, after waiting for other threads."""
         with self._lock:
             return self._encoder.encode_text(prompts)
 
@@ -39,8 +39,8 @@ class Session:
 
     Attributes:
         pipeline: The map and the models that describe images.
-        worker: The thread that feeds the pipeline.
-        text: The pipeline's text encoder, for any thread.
+        worker: The mapping thread, which feeds the pipeline.
+        text: The pipeline's text encoder, safe to use in any thread.
     """
 
     pipeline: Pipeline
@@ -48,31 +48,31 @@ class Session:
     text: SerialTextEncoder = field(init=False)
 
     def __post_init__(self) -> None:
-        """Guard the text encoder."""
+        """Wrap the text encoder."""
         object.__setattr__(self, "text", SerialTextEncoder(self.pipeline.trio.text))
 
 
 class SessionHolder:
-    """Where the parts of the node find the session of the moment."""
+    """Holder of the current session, which the parts of the node share."""
 
     def __init__(self) -> None:
-        """Hold none."""
+        """Start without a session."""
         self._session: Session | None = None
 
     @property
     def current(self) -> Session | None:
-        """The session, None while the node is unconfigured."""
+        """The session; None while the node is unconfigured."""
         return self._session
 
     def replace(self, session: Session | None) -> None:
-        """Begin another session, or none."""
+        """Hold another session, or none."""
         self._session = session
 
     def require(self) -> Session:
-        """The session.
+        """Return the session.
 
         Raises:
-            MapError: There is none.
+            MapError: The node is unconfigured.
         """
         if self._session is None:
             raise MapError("the node is unconfigured and has no map; configure it first")

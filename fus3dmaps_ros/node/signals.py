@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM: the first one stops the program, a later one says not to wait any longer."""
+"""SIGINT and SIGTERM: the first one stops the program, a later one stops it without waiting."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import time
 
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ECHO_S = 1.0
-"""Signals this soon after the first are the same request: service managers signal a launch, and the launch its nodes."""
+"""Signals within this time of the first are the same request: service managers signal a launch, and it signals nodes."""
 
 
 class StopSignals:
-    """Takes both signals for this process; the first raises KeyboardInterrupt in the main thread, no other does.
+    """Handler of both signals in this process. Only the first raises KeyboardInterrupt, in the main thread.
 
     Attributes:
-        hurried: Whether one came more than ``ECHO_S`` after the first.
+        hurried: Whether a signal came more than ``ECHO_S`` after the first.
     """
 
     def __init__(self) -> None:
-        """Take them from now on; must be called by the main thread."""
+        """Install the handler; must be called by the main thread."""
         self.hurried = False
         self._first_s: float | None = None
         for number in STOP_SIGNALS:
             signal.signal(number, self._take)
 
     def hold(self) -> None:
-        """Have no signal interrupt any more: what comes now is as after a first one."""
+        """Let no signal interrupt any more: the next one counts as if there had been a first one now."""
         if self._first_s is None:
             self._first_s = time.monotonic()
 

@@ -1,4 +1,4 @@
-"""Work with a time limit: who waits is told in time, and what cannot be interrupted ends on its own."""
+"""Work with a time limit: callers are answered in time, and work that cannot be interrupted ends on its own."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ T = TypeVar("T")
 
 
 class CallTimeoutError(Fus3dmapsError):
-    """A call was not done within its time."""
+    """A call was not done in time."""
 
 
 class Deadline:
-    """A moment by which a call must be answered."""
+    """A time by which a call must be answered."""
 
     def __init__(self, timeout_s: float) -> None:
-        """So many seconds from now, by a steady clock."""
+        """Set it ``timeout_s`` seconds from now, on a steady clock."""
         self.timeout_s = timeout_s
         self._end_s = time.monotonic() + timeout_s
 
     def remaining_s(self) -> float:
-        """Seconds left; 0 once it has passed."""
+        """Return the seconds left; 0 after the deadline."""
         return max(0.0, self._end_s - time.monotonic())
 
 
@@ -35,25 +35,25 @@ class TimedCalls:
     """Runs one piece of work at a time in a thread of its own."""
 
     def __init__(self, name: str) -> None:
-        """Nothing is in work yet.
+        """Start without any work.
 
         Args:
-            name: Of the service, for messages and the thread.
+            name: The service's name, for messages and the thread.
         """
         self._name = name
         self._free = threading.Semaphore()
 
     def run(self, work: Callable[[], T], deadline: Deadline, afterwards: str = "") -> T:
-        """Run work and wait for its result until a deadline; then its result is thrown away when it comes.
+        """Run work and wait for its result until a deadline; a result that comes later is discarded.
 
         Args:
-            work: What to do; must leave everything whole if nobody takes its result.
-            deadline: Until when to wait.
-            afterwards: What becomes of the work after that, for the message.
+            work: The function to call; its effects must be complete even if nobody takes its result.
+            deadline: The latest time to wait for.
+            afterwards: What happens to the work after the deadline, for the message.
 
         Raises:
-            CallTimeoutError: Not done in time, or the work before it still goes on.
-            Exception: What the work raises.
+            CallTimeoutError: The work is not done in time, or an earlier one is still in progress.
+            Exception: Any exception of the work.
         """
         if not self._free.acquire(timeout=deadline.remaining_s()):
             raise CallTimeoutError(
@@ -82,16 +82,16 @@ class TimedCalls:
 
 
 def between_frames(future: Future[T], deadline: Deadline) -> T:
-    """Wait for what was given to the mapping thread; what has not begun by the deadline never will.
+    """Wait for a short call that the mapping thread makes; if it has not begun by the deadline, cancel it.
 
     Args:
-        future: Of :meth:`FrameWorker.between_frames`, for work of an instant.
-        deadline: Until when it must have begun.
+        future: Result of :meth:`FrameWorker.between_frames`.
+        deadline: The time by which the call must have begun.
 
     Raises:
-        CallTimeoutError: The frame in work was not done in time.
+        CallTimeoutError: The mapping thread was busy with a frame until the deadline.
         MapError: The mapping thread ends.
-        Exception: What the work raises.
+        Exception: Any exception of the call.
     """
     with contextlib.suppress(TimeoutError, CancelledError):
         future.exception(deadline.remaining_s())

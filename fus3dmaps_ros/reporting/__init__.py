@@ -1,1 +1,1 @@
-"""What the node says about itself: status and diagnostics."""
+"""Reports of the node about itself: status and diagnostics."""

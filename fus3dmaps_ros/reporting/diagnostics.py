@@ -1,4 +1,4 @@
-"""Publishes how the mapping fares on ``/diagnostics``, where ``rqt_robot_monitor``, Foxglove and aggregators look for it."""
+"""The health of the mapping on ``/diagnostics``, which ``rqt_robot_monitor``, Foxglove and aggregators read."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DEPTH = 10
 
 
 class Diagnostics:
-    """Publishes one status per part (inputs, mapping, map, memory) by period."""
+    """Publishes one status per part (inputs, mapping, map, memory) periodically."""
 
     def __init__(
         self,
@@ -35,12 +35,12 @@ class Diagnostics:
         """Advertise the topic and start the timer.
 
         Args:
-            node: Owner of the publisher; its graph tells the QoS of the inputs' publishers.
-            diagnosis: What is published.
+            node: Owner of the publisher; its graph knows the QoS of the publishers of the inputs.
+            diagnosis: The diagnosis to publish.
             topics: The topics of its streams.
-            read_sizes: Tells how large the map is; called once a period, from the executor.
-            read_memory: Tells how full each memory is; as ``read_sizes``.
-            hardware_id: What the status belongs to, e.g. the encoder's device.
+            read_sizes: Returns how large the map is; called once a period by the executor.
+            read_memory: Returns how full each memory is; called in the same way.
+            hardware_id: The device that the status is about, e.g. the encoder's.
             period_s: Time between two messages, seconds.
         """
         self._node = node
@@ -52,7 +52,7 @@ class Diagnostics:
         self._lock = threading.Lock()
         self._is_closed = False
         self._publisher = node.create_publisher(DiagnosticArray, TOPIC, _DEPTH)
-        # Steady: a clock that stands still is among what has to be told.
+        # Steady: a ROS clock that stands still is one of the problems to report.
         self._timer = node.create_timer(
             period_s,
             self.publish,
@@ -61,7 +61,7 @@ class Diagnostics:
         )
 
     def publish(self) -> None:
-        """Publish the state as it is now."""
+        """Publish the current state."""
         offers = {topic: publishers_of(self._node, topic) for topic in self._topics}
         reports = self._diagnosis.report(self._read_sizes(), self._read_memory(), offers)
         message = DiagnosticArray(status=[self._to_status(report) for report in reports])
@@ -71,8 +71,8 @@ class Diagnostics:
                 self._publisher.publish(message)
 
     def close(self) -> None:
-        """Stop the timer and take the topic back."""
-        with self._lock:  # A report that is being made is not published any more.
+        """Stop the timer and remove the topic."""
+        with self._lock:  # A report that is being made now will not be published.
             self._is_closed = True
         self._node.destroy_timer(self._timer)
         self._node.destroy_publisher(self._publisher)
@@ -88,7 +88,7 @@ class Diagnostics:
 
 
 def publishers_of(node: Node, topic: str) -> list[Offer]:
-    """The publishers of a topic as the node's graph knows them now.
+    """Return the publishers of a topic that the node's graph knows now.
 
     Args:
         node: Resolves the name and knows the graph.

@@ -1,4 +1,4 @@
-"""What the mapper does, as a message on ``~/status`` and as a line in the log."""
+"""The status of the node, as a message on ``~/status`` and as a line in the log."""
 
 from __future__ import annotations
 
@@ -9,22 +9,16 @@ import torch
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
 from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.ledger import FrameCounts
 from fus3dmaps_msgs.msg import MapperStatus
 from fus3dmaps_ros.node.autosave import Autosave
 from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.node.timers import change_period
-from fus3dmaps_ros.node.worker import WorkerCounts
+from fus3dmaps_ros.topics.qos import LATCHED
 
-_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
 _LOG_PERIOD_S = 5.0
 
 
@@ -38,17 +32,17 @@ def status_message(
     rates_hz: Mapping[str, float],
     problems: Sequence[str],
 ) -> MapperStatus:
-    """The report of one moment.
+    """Make the status message of this moment.
 
     Args:
-        header: The node's clock and the map frame.
+        header: Time of the node's clock, and the map frame.
         state: Label of the lifecycle state.
-        config: The configuration in force.
+        config: The current configuration.
         session: Models, map and mapping thread; None while unconfigured.
-        autosave: Its automatic saves.
+        autosave: Automatic saves of the session; None while unconfigured.
         drops: Messages and frames dropped, by reason.
         rates_hz: Messages a second, by topic.
-        problems: What is wrong, in words.
+        problems: Sentences that say what is wrong.
     """
     message = MapperStatus(
         header=header,
@@ -66,7 +60,7 @@ def status_message(
     )
     if session is not None:
         message.encoder = session.pipeline.trio.name
-        counts, times = session.worker.counts(), session.worker.stage_times()
+        counts, times = session.worker.ledger.counts(), session.worker.ledger.stage_times()
         message.frames, message.not_keyframes = counts.frames, counts.not_keyframes
         message.dense_keyframes, message.instance_keyframes = counts.dense_keyframes, counts.instance_keyframes
         message.queue_depth = session.worker.waiting
@@ -84,8 +78,8 @@ def status_message(
 
 
 def status_line(session: Session | None, drops: Mapping[str, int]) -> str:
-    """One line on what came in, what was mapped, what was dropped and how large the map is."""
-    counts = session.worker.counts() if session else WorkerCounts()
+    """Describe in one line what came in, what was mapped, what was dropped and how large the map is."""
+    counts = session.worker.ledger.counts() if session else FrameCounts()
     waiting = session.worker.waiting if session else 0
     voxels = session.pipeline.semantic_map.voxel_count if session else 0
     instances = session.pipeline.semantic_map.instance_count if session else 0
@@ -98,14 +92,14 @@ def status_line(session: Session | None, drops: Mapping[str, int]) -> str:
 
 
 def gpu_bytes() -> int:
-    """Bytes of GPU memory that this process has allocated, over all devices; 0 where it uses none."""
+    """Return the bytes of GPU memory that this process has allocated on all devices; 0 if it uses none."""
     if not (torch.cuda.is_available() and torch.cuda.is_initialized()):
         return 0
     return sum(torch.cuda.memory_reserved(device) for device in range(torch.cuda.device_count()))
 
 
 class StatusPublisher:
-    """Publishes ``~/status`` by period in every state, and now and then logs a line when something has changed."""
+    """Publishes ``~/status`` periodically in every state, and logs a line every few seconds if it has changed."""
 
     def __init__(
         self,
@@ -118,22 +112,22 @@ class StatusPublisher:
 
         Args:
             node: Owner of the publisher.
-            read: Gives the configuration in force.
+            read: Returns the current configuration.
             report: Makes the message.
-            line: Makes the line for the log, and gives the problems by kind: each is added to a line when it appears.
+            line: Makes the line for the log, and returns the problems by kind; a new problem is added to the line.
         """
         self._node = node
         self._log = node.get_logger()
         self._report = report
         self._line = line
         self._told, self._known = "", frozenset[str]()
-        self._publisher = node.create_publisher(MapperStatus, "~/status", _QOS)
+        self._publisher = node.create_publisher(MapperStatus, "~/status", LATCHED)
         group, clock = MutuallyExclusiveCallbackGroup(), Clock(clock_type=ClockType.STEADY_TIME)
         self._timer = node.create_timer(read().node.status_period_s, self._publish, callback_group=group, clock=clock)
         self._line_timer = node.create_timer(_LOG_PERIOD_S, self._say, callback_group=group, clock=clock)
 
     def follow(self, config: Config) -> None:
-        """Take over ``node.status_period_s``."""
+        """Apply ``node.status_period_s``."""
         change_period(self._node, self._timer, config.node.status_period_s)
 
     def _publish(self) -> None:

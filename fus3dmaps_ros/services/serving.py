@@ -1,4 +1,4 @@
-"""What all services have in common: a time limit, and that whatever goes wrong is a reply, never an exception."""
+"""The base of all services: each call has a time limit, and every failure becomes a reply."""
 
 from __future__ import annotations
 
@@ -8,46 +8,37 @@ from typing import Any, TypeVar
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import Fus3dmapsError
 from fus3dmaps_ros.node.timed_calls import Deadline, TimedCalls
+from fus3dmaps_ros.topics.qos import SERVICE_QOS
 
 T = TypeVar("T")
 
-SERVICE_QOS = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1000,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.VOLATILE,
-)
-"""The default keeps ten requests: of a hundred that come at once, ninety would wait for ever. Who sends many at once from
-one client needs it there, too, for requests that wait to be taken and replies."""
-
 
 class Call:
-    """One call of a service, with the time that it has."""
+    """One call of a service, with its time limit."""
 
     def __init__(self, calls: TimedCalls, timeout_s: float) -> None:
-        """The time begins."""
+        """Start the time."""
         self._calls = calls
         self.deadline = Deadline(timeout_s)
 
     def in_time(self, work: Callable[[], T], afterwards: str = "") -> T:
-        """The result of work that may take long, see :meth:`TimedCalls.run`."""
+        """Run work that may take long and return its result, see :meth:`TimedCalls.run`."""
         return self._calls.run(work, self.deadline, afterwards)
 
 
 class ServiceGroup:
-    """Offers services that wait neither for each other nor for mapping. Calls of one service take turns."""
+    """Services that wait neither for each other nor for mapping. Calls of one service take turns."""
 
     def __init__(self, node: Node, read: Callable[[], Config]) -> None:
-        """Offer nothing yet.
+        """Start without services.
 
         Args:
             node: Owner of the services.
-            read: Gives the configuration in force; ``node.service_timeout_s`` is the time that each call has.
+            read: Returns the current configuration; ``node.service_timeout_s`` is the time limit of each call.
         """
         self._node = node
         self._read = read
@@ -57,8 +48,8 @@ class ServiceGroup:
         """Offer a service.
 
         Args:
-            service_type: Its type; the response has ``success`` and ``message``.
-            name: Under the node's own name.
+            service_type: The service's type; its response has ``success`` and ``message``.
+            name: The service's name below the node's own name.
             answer: Takes request, response and call, fills in the response and returns the message of success.
         """
         calls = TimedCalls(name)
@@ -70,7 +61,7 @@ class ServiceGroup:
             except Fus3dmapsError as error:
                 response = self._refusal(service_type, str(error))
             except Exception as error:
-                # A defect, or a device that failed: the caller is told, the log has the details, the node lives on.
+                # A bug, or a device that failed: the caller gets a message, the log gets the details, and the node goes on.
                 response = self._refusal(service_type, f"internal error: {type(error).__name__}: {error}")
                 self._node.get_logger().error(f"{name} failed\n{traceback.format_exc()}")
             return response
@@ -87,5 +78,5 @@ class ServiceGroup:
 
     @staticmethod
     def _refusal(service_type: Any, message: str) -> Any:
-        # A fresh one: what a failed call had filled in is no answer. Replacement keeps odd text out of the middleware.
+        # A new response, because a failed call may have filled in half of one. Odd text could break the middleware.
         return service_type.Response(success=False, message=message.encode("utf-8", "replace").decode())

@@ -1,1 +1,1 @@
-"""What the node subscribes to and publishes."""
+"""Topics of the node: subscriptions, publishers and message conversions."""

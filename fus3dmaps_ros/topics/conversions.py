@@ -1,4 +1,4 @@
-"""Arrays to messages and back. Knows message types and nothing of nodes."""
+"""Conversions of arrays to messages and back, without any node."""
 
 from __future__ import annotations
 
@@ -35,24 +35,24 @@ _FIELD_TYPES: dict[np.dtype[Any], int] = {
     np.dtype(np.float64): PointField.FLOAT64,
 }
 _SCALARS = {code: dtype for dtype, code in _FIELD_TYPES.items()}
-_GOLDEN_RATIO = 0.618033988749895  # Successive multiples are spread evenly over the colour circle, however many there are.
+_GOLDEN_RATIO = 0.618033988749895  # Its multiples are spread evenly over the colour circle, however many there are.
 _LABEL_HEIGHT_M = 0.12
 
 
 def to_header(stamp_ns: int, frame: str) -> Header:
-    """A header with a stamp given in nanoseconds."""
+    """Make a header with a stamp given in nanoseconds."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     return Header(stamp=Time(sec=seconds, nanosec=nanoseconds), frame_id=frame)
 
 
 def to_duration(seconds: float) -> Duration:
-    """A duration message."""
+    """Make a duration message."""
     whole, nanoseconds = divmod(round(seconds * 1e9), 1_000_000_000)
     return Duration(sec=whole, nanosec=nanoseconds)
 
 
 def to_cloud(header: Header, points_m: NDArray[np.floating], columns: Mapping[str, NDArray[Any]]) -> PointCloud2:
-    """A dense, unorganised point cloud.
+    """Make a dense, unorganised point cloud.
 
     Args:
         header: Stamp and frame.
@@ -67,7 +67,7 @@ def to_cloud(header: Header, points_m: NDArray[np.floating], columns: Mapping[st
         table[name] = column
     offsets: Mapping[str, Any] = table.dtype.fields or {}
     data = array.array("B")
-    data.frombytes(table.tobytes())  # The setter of the message checks every element of any other sequence.
+    data.frombytes(table.tobytes())  # The message checks every element of any other kind of sequence.
     return PointCloud2(
         header=header,
         height=1,
@@ -84,7 +84,7 @@ def to_cloud(header: Header, points_m: NDArray[np.floating], columns: Mapping[st
 
 
 def from_cloud(message: PointCloud2) -> NDArray[Any]:
-    """The points of a cloud as a structured array (n,) with the message's field names; the inverse of :func:`to_cloud`."""
+    """Read a cloud as a structured array (n,) with the message's field names; the inverse of :func:`to_cloud`."""
     order: Literal[">", "<"] = ">" if message.is_bigendian else "<"
     names: list[str] = [field.name for field in message.fields]
     formats: list[np.dtype[Any]] = [_SCALARS[field.datatype].newbyteorder(order) for field in message.fields]
@@ -94,32 +94,37 @@ def from_cloud(message: PointCloud2) -> NDArray[Any]:
     return np.frombuffer(message.data, dtype=layout, count=message.width * message.height)
 
 
+def cloud_points(table: NDArray[Any]) -> NDArray[np.float32]:
+    """Return the positions (n, 3), metres, of the points that :func:`from_cloud` has read."""
+    return np.stack([table[axis] for axis in "xyz"], axis=1)
+
+
 def pack_rgb(colors: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Colours (n, 3) as the packed float32 ``rgb`` field that PCL and RViz read."""
+    """Pack colours (n, 3) into the float32 ``rgb`` field that PCL and RViz read."""
     wide = colors.astype(np.uint32)
     return (wide[:, 0] << 16 | wide[:, 1] << 8 | wide[:, 2]).view(np.float32)
 
 
 def unpack_rgb(packed: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """The inverse of :func:`pack_rgb`: (n, 3) uint8."""
+    """Unpack colours, (n, 3) uint8; the inverse of :func:`pack_rgb`."""
     wide = np.ascontiguousarray(packed).view(np.uint32)
     return np.stack([wide >> 16 & 255, wide >> 8 & 255, wide & 255], axis=1).astype(np.uint8)
 
 
 def to_similarity_cloud(header: Header, answer: QueryAnswer) -> PointCloud2:
-    """The voxels of an answer: x, y, z, similarity and rgb."""
+    """Make a cloud of the voxels of an answer: x, y, z, similarity and rgb."""
     columns = {"similarity": answer.similarity, "rgb": pack_rgb(similarity_colors(answer.similarity))}
     return to_cloud(header, answer.points_m, columns)
 
 
 def empty_similarity_cloud(header: Header) -> PointCloud2:
-    """A similarity cloud without points."""
+    """Make a similarity cloud without points."""
     nothing = np.empty(0, np.float32)
     return to_cloud(header, np.empty((0, 3), np.float32), {"similarity": nothing, "rgb": nothing})
 
 
 def to_label_cloud(header: Header, voxels: LabelledVoxels) -> PointCloud2:
-    """Labelled voxels: x, y, z, label (int32), score and rgb (one colour a label)."""
+    """Make a cloud of labelled voxels: x, y, z, label (int32), score and rgb (one colour a label)."""
     colors = np.zeros((int(voxels.labels.max(initial=0)) + 1, 3), np.uint8)
     for label in np.unique(voxels.labels).tolist():
         color = instance_color(label, alpha=1.0)
@@ -129,19 +134,19 @@ def to_label_cloud(header: Header, voxels: LabelledVoxels) -> PointCloud2:
 
 
 def empty_label_cloud(header: Header) -> PointCloud2:
-    """A label cloud without points."""
+    """Make a label cloud without points."""
     nothing = np.empty(0, np.float32)
     return to_label_cloud(header, LabelledVoxels("", np.empty((0, 3), np.float32), np.empty(0, np.int32), nothing))
 
 
 def to_map_cloud(header: Header, voxels: VoxelSnapshot) -> PointCloud2:
-    """The voxels of the map: x, y, z, rgb (mean colour) and instance (id of the top hypothesis, -1 without one)."""
+    """Make a cloud of the map: x, y, z, rgb (mean colour) and instance (id of the top hypothesis, -1 without one)."""
     columns = {"rgb": pack_rgb(voxels.colors), "instance": voxels.top_instance.astype(np.int32)}
     return to_cloud(header, voxels.centers_m, columns)
 
 
 def to_instance(header: Header, found: RankedInstance) -> SemanticInstance:
-    """A ranked instance as a message."""
+    """Make a message of a ranked instance."""
     return SemanticInstance(
         header=header,
         id=found.id,
@@ -155,8 +160,22 @@ def to_instance(header: Header, found: RankedInstance) -> SemanticInstance:
     )
 
 
+def from_instance(message: SemanticInstance) -> RankedInstance:
+    """Read a ranked instance from a message; the inverse of :func:`to_instance`."""
+    return RankedInstance(
+        id=message.id,
+        prompt=message.prompt,
+        score=message.score,
+        weight=message.weight,
+        centroid_m=from_point(message.centroid).astype(np.float32),
+        box_min_m=from_point(message.box_min).astype(np.float32),
+        box_max_m=from_point(message.box_max).astype(np.float32),
+        voxels=message.voxels,
+    )
+
+
 def to_instances(header: Header, instances: InstanceSnapshot, min_voxels: int) -> list[SemanticInstance]:
-    """The instances that occupy at least ``min_voxels`` voxels, and at least one, by ascending id; without a prompt."""
+    """Make messages of the instances with at least ``min_voxels`` voxels (at least one), by ascending id, without prompt."""
     return [
         SemanticInstance(
             header=header,
@@ -172,13 +191,18 @@ def to_instances(header: Header, instances: InstanceSnapshot, min_voxels: int) -
 
 
 def to_point(position_m: NDArray[np.floating] | Sequence[float]) -> Point:
-    """A point message of three metres."""
+    """Make a point message of a position, metres."""
     x, y, z = (float(value) for value in position_m)
     return Point(x=x, y=y, z=z)
 
 
+def from_point(point: Point) -> NDArray[np.float64]:
+    """Read a point message as (3,) metres."""
+    return np.array([point.x, point.y, point.z])
+
+
 def to_path(header: Header, poses: NDArray[np.float64]) -> Path:
-    """Poses (n, 4, 4) as a path; every pose bears the header of the whole."""
+    """Make a path of poses (n, 4, 4); every pose has the header of the path."""
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else np.empty((0, 4))
     path = Path(header=header)
     for position, (x, y, z, w) in zip(poses[:, :3, 3], quaternions.tolist(), strict=True):
@@ -188,7 +212,7 @@ def to_path(header: Header, poses: NDArray[np.float64]) -> Path:
 
 
 def to_markers(header: Header, instances: InstanceSnapshot, min_voxels: int) -> MarkerArray:
-    """A translucent box and its id for every instance that occupies at least ``min_voxels`` voxels.
+    """Make a translucent box and its id for every instance with at least ``min_voxels`` voxels.
 
     The first marker clears what earlier arrays have drawn.
     """
@@ -201,10 +225,10 @@ def to_markers(header: Header, instances: InstanceSnapshot, min_voxels: int) -> 
 
 
 def to_answer_markers(header: Header, found: Sequence[SemanticInstance]) -> MarkerArray:
-    """A translucent box for every instance of an answer, and over it the prompt and the score; without any, a clearing."""
+    """Make a translucent box, and over it prompt and score, for every instance of an answer; earlier ones are cleared."""
     markers = [Marker(header=header, action=Marker.DELETEALL)]
     for number, instance in enumerate(found):
-        low, high = (np.array([corner.x, corner.y, corner.z]) for corner in (instance.box_min, instance.box_max))
+        low, high = from_point(instance.box_min), from_point(instance.box_max)
         text = f"{instance.prompt} {instance.score:.2f}"
         markers += _labelled_box(header, number, low, high, text, instance_color(instance.id, alpha=0.4))
     return MarkerArray(markers=markers)
@@ -234,6 +258,6 @@ def _labelled_box(
 
 
 def instance_color(instance_id: int, alpha: float) -> ColorRGBA:
-    """A colour that stays the same for an id and differs clearly between successive ones."""
+    """Return a colour that is always the same for an id and differs clearly between successive ids."""
     red, green, blue = colorsys.hsv_to_rgb(instance_id * _GOLDEN_RATIO % 1.0, 0.8, 1.0)
     return ColorRGBA(r=red, g=green, b=blue, a=alpha)

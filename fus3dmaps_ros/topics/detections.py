@@ -1,4 +1,4 @@
-"""Answers as ``vision_msgs`` boxes, where that package is installed: what navigation and manipulation stacks read."""
+"""Answers as ``vision_msgs`` boxes, which navigation and manipulation stacks read, if that package is installed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from fus3dmaps_msgs.msg import SemanticInstance
 
 
 def vision_messages() -> ModuleType | None:
-    """The module ``vision_msgs.msg``, None where it is not installed."""
+    """Return the module ``vision_msgs.msg``, or None if it is not installed."""
     try:
         return importlib.import_module("vision_msgs.msg")
     except ImportError:
@@ -21,11 +21,11 @@ def vision_messages() -> ModuleType | None:
 
 
 def to_detections(messages: ModuleType, header: Header, found: Sequence[SemanticInstance]) -> object:
-    """Instances of an answer as a ``Detection3DArray``.
+    """Make a ``Detection3DArray`` of the instances of an answer.
 
     Args:
-        messages: What :func:`vision_messages` has found.
-        header: Map frame, and how new the map was.
+        messages: The module from :func:`vision_messages`.
+        header: Map frame, and stamp of the map.
         found: The instances; each becomes an axis-aligned box with one hypothesis, the prompt and its score, at the
             instance's centroid.
     """

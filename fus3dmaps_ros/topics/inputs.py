@@ -1,9 +1,8 @@
-"""Subscriptions to what cameras and a localisation publish, paired into frames."""
+"""Subscriptions to cameras and poses, whose messages are paired into frames."""
 
 from __future__ import annotations
 
 import threading
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -12,15 +11,14 @@ from nav_msgs.msg import Odometry
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fus3dmaps_core.config.input import QosProfile
 from fus3dmaps_core.config.schema import Config
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages.fields import stamp_ns
 from fus3dmaps_core.sources.pairing import FramePairer, PairedMessages
-from fus3dmaps_core.sources.streams import QOS_PROFILES, Stream, uses_tf
-from fus3dmaps_ros.node.drops import DropLog
+from fus3dmaps_core.sources.streams import Stream, uses_tf
+from fus3dmaps_ros.topics.qos import named_qos
 from fus3dmaps_ros.topics.tf_poses import TfListener
 
 _TYPES: dict[str, type[Any]] = {
@@ -31,17 +29,18 @@ _TYPES: dict[str, type[Any]] = {
     "geometry_msgs/msg/PoseWithCovarianceStamped": PoseWithCovarianceStamped,
     "nav_msgs/msg/Odometry": Odometry,
 }
-# Deep enough to ride out a pause of the interpreter of a third of a second at 30 Hz; the profile's usual 5 are not.
+# Deep enough for a pause of the interpreter of a third of a second at 30 Hz; the usual depth of 5 is not.
 _IMAGE_DEPTH = 10
 _POSE_DEPTH = 200
-_TF_PERIOD_S = 0.02  # How soon after a transform the image that waits for it goes on.
+_POSE_PARAMETERS = ("input.pose_topic", "input.pose_with_covariance_topic", "input.odometry_topic")
+_TF_PERIOD_S = 0.02  # Longest time that an image waits after its transform has come.
 
 
 class Inputs:
-    """Subscribes to colour, depth, camera models and poses, and hands complete frames on.
+    """Subscribes to colour, depth, camera models and poses, and passes complete frames on.
 
     Attributes:
-        streams: What is subscribed to.
+        streams: The topics and their message types.
     """
 
     def __init__(
@@ -49,7 +48,7 @@ class Inputs:
         node: Node,
         config: Config,
         take: Callable[[PairedMessages], None],
-        drops: DropLog,
+        drops: Drops,
         arrived: Callable[[str, int], None] | None = None,
     ) -> None:
         """Subscribe.
@@ -57,19 +56,18 @@ class Inputs:
         Args:
             node: Owner of the subscriptions.
             config: Topics, pairing and QoS.
-            take: Gets every complete frame, in stamp order; must not block.
-            drops: Counts what led to no frame.
-            arrived: Is told the topic and the stamp (nanoseconds) of every message.
+            take: Called with every complete frame, in stamp order; must not block.
+            drops: Counts messages that led to no frame.
+            arrived: Called with the topic and the stamp (nanoseconds) of every message.
 
         Raises:
-            ConfigError: A mounting is not a pose, or TF is wanted and not installed.
+            ConfigError: A mounting is not a pose, or TF is needed and not installed.
         """
         self._node = node
         self._lock = threading.Lock()
         self._take = take
         self._drops = drops
         self._arrived = arrived
-        self._reported: Counter[str] = Counter()
         self._tf = TfListener(node) if uses_tf(config.input) else None
         self._pairer = FramePairer(config.input, self._tf)
         group = MutuallyExclusiveCallbackGroup()
@@ -79,14 +77,14 @@ class Inputs:
                 _TYPES[stream.msgtype],
                 stream.topic,
                 self._callback(stream),
-                input_qos(stream.profile, _POSE_DEPTH if stream.role == "pose" else _IMAGE_DEPTH),
+                named_qos(stream.profile, _POSE_DEPTH if stream.role == "pose" else _IMAGE_DEPTH),
                 callback_group=group,
             )
             for stream in self.streams
         ]
         self._timer = None
         if self._tf is not None:
-            # What comes on /tf passes by the pairer. The clock of the machine: that of a simulation may stand still.
+            # The pairer does not see messages on /tf, so it is polled. A steady clock: that of a simulation may stand still.
             self._timer = node.create_timer(
                 _TF_PERIOD_S, self._hand_on, callback_group=group, clock=Clock(clock_type=ClockType.STEADY_TIME)
             )
@@ -97,7 +95,7 @@ class Inputs:
             self._pairer.reset()
 
     def close(self) -> None:
-        """Unsubscribe and forget what waits. Of no further use then; can be called again."""
+        """Unsubscribe for good and forget what waits; can be called again."""
         if self._timer is not None:
             self._node.destroy_timer(self._timer)
             self._timer = None
@@ -122,29 +120,7 @@ class Inputs:
         """Offer the frames that are complete and report what was dropped."""
         with self._lock:
             ready = self._pairer.poll()
-            news = {
-                reason: (count - self._reported[reason], self._pairer.last_drop[reason])
-                for reason, count in self._pairer.drops.items()
-                if count > self._reported[reason]
-            }
-            self._reported = Counter(self._pairer.drops)
-        for reason, (number, sentence) in news.items():
-            self._drops.count(reason, sentence, number)
+        # Together: many images that are given up at once are one line in the log.
+        self._pairer.hand_over_drops(self._drops)
         for paired in ready:
             self._take(paired)
-
-
-def input_qos(profile: QosProfile, depth: int) -> QoSProfile:
-    """The QoS of an input by profile name.
-
-    ``sensor_data`` is best effort and volatile, and matches any publisher; ``reliable`` is volatile, too;
-    ``transient_local`` is reliable and gets what a latched publisher said before; ``best_available`` is the most
-    that all publishers give that are there when it subscribes, and with none there as ``transient_local``.
-    """
-    qos = QOS_PROFILES[profile]
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy[qos.reliability],
-        durability=DurabilityPolicy[qos.durability],
-    )

@@ -1,4 +1,4 @@
-"""What the node publishes: the map, its instances, the camera's path, and the last answer that was to be published."""
+"""Publishers of the map, its instances, the camera's path, and the last answer that was asked to be published."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
@@ -21,22 +20,15 @@ from fus3dmaps_ros.node.session import SessionHolder
 from fus3dmaps_ros.node.timers import change_period
 from fus3dmaps_ros.topics import conversions
 from fus3dmaps_ros.topics.detections import to_detections, vision_messages
-
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-"""QoS of everything published: late subscribers get the last message."""
+from fus3dmaps_ros.topics.qos import LATCHED
 
 _LOG_PERIOD_S = 5.0
 
 
 class Outputs:
-    """Publishes the map by period while someone listens, and answers on request.
+    """Publishes the map periodically while someone subscribes, and answers on request.
 
-    By period: ``~/map``, ``~/instances`` and ``~/path``. On request: ``~/similarity``, ``~/answer``, ``~/labels``, and
+    Periodically: ``~/map``, ``~/instances`` and ``~/path``. On request: ``~/similarity``, ``~/answer``, ``~/labels``, and
     ``~/detections`` where ``vision_msgs`` is installed.
     """
 
@@ -45,8 +37,8 @@ class Outputs:
 
         Args:
             node: Owner of the publishers.
-            sessions: Whose map and keyframes are shown; while there is none, nothing is.
-            read: Gives the configuration in force.
+            sessions: Has the map and the keyframes; without a session nothing is published.
+            read: Returns the current configuration.
         """
         self._node = node
         self._log = node.get_logger()
@@ -63,7 +55,7 @@ class Outputs:
         self._instances = node.create_publisher(MarkerArray, "~/instances", LATCHED)
         self._path = node.create_publisher(Path, "~/path", LATCHED)
         self._shown: dict[Publisher, tuple[object, int, int]] = {}
-        # Steady: under simulated time a paused clock must not stop what a person looks at.
+        # Steady: a paused simulation clock must not stop the display.
         self._timer = node.create_timer(
             read().node.publish_period_s,
             self._publish_map,
@@ -72,7 +64,7 @@ class Outputs:
         )
 
     def header(self) -> Header:
-        """Map frame, and the stamp of the latest mapped frame; 0 without one."""
+        """Make a header with the map frame and the stamp of the latest mapped frame; 0 without one."""
         session = self._sessions.current
         return conversions.to_header(session.worker.stamp_ns if session else 0, self._read().input.map_frame)
 
@@ -88,24 +80,24 @@ class Outputs:
         self._labels.publish(cloud)
 
     def clear_answers(self) -> None:
-        """Replace the last answers, which are latched, by empty ones: the map that they were of is no more."""
+        """Replace the last answers, which are latched, by empty ones, because their map is gone."""
         header = self.header()
         self.publish_answer(conversions.empty_similarity_cloud(header), [])
         self._labels.publish(conversions.empty_label_cloud(header))
 
     def follow(self, config: Config) -> None:
-        """Take over ``node.publish_period_s``."""
+        """Apply ``node.publish_period_s``."""
         change_period(self._node, self._timer, config.node.publish_period_s)
 
     def _publish_map(self) -> None:
         try:
             self.publish_map()
         except Exception:
-            # For example for want of memory for a copy of the map; the next one may succeed, mapping goes on anyway.
+            # For example there is no memory for a copy of the map. The next attempt may succeed, and mapping goes on.
             self._log.error(f"publishing the map failed\n{traceback.format_exc()}", throttle_duration_sec=_LOG_PERIOD_S)
 
     def publish_map(self) -> None:
-        """Publish voxels, instances and keyframe poses, each if it has a subscriber who has not seen this state yet."""
+        """Publish voxels, instances and keyframe poses, each if a subscriber has not got this state yet."""
         session = self._sessions.current
         if session is None:
             return

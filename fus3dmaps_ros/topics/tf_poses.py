@@ -1,4 +1,4 @@
-"""TF on a robot: tf2's buffer, filled by its listener, behind the core's interface."""
+"""TF on a robot: the buffer and listener of tf2, with the interface that the core expects."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from fus3dmaps_core.sources.transforms import NoTransform, TransformGap
 
 
 def import_tf2_ros() -> Any:
-    """The package through which TF is read.
+    """Import the package that reads TF.
 
     Raises:
-        ConfigError: It is not installed; the message names the parameters that want it and what to install.
+        ConfigError: It is not installed; the message names the parameters that need it and what to install.
     """
     try:
         return import_module("tf2_ros")
@@ -33,12 +33,12 @@ def import_tf2_ros() -> Any:
 class TfListener:
     """Listens to ``/tf`` and ``/tf_static`` through tf2_ros and answers lookups without waiting.
 
-    tf2 interpolates across gaps of any length within its ten seconds of history, so that ``input.max_pose_gap_s`` is of no
-    effect here. Lookups are safe from any thread.
+    tf2 interpolates across gaps of any length within its ten seconds of history, so ``input.max_pose_gap_s`` has no effect
+    here. Lookups are safe in any thread.
     """
 
     def __init__(self, node: Node) -> None:
-        """Start to listen.
+        """Start listening.
 
         Args:
             node: Owner of the subscriptions.
@@ -51,7 +51,7 @@ class TfListener:
         self._listener = tf2_ros.TransformListener(self._buffer, node)
 
     def lookup(self, target_frame: str, source_frame: str, stamp_ns: int) -> NDArray[np.float64] | NoTransform:
-        """T_target_source at a stamp, (4, 4) float64, or why there is none.
+        """Return T_target_source at a stamp, (4, 4) float64, or the reason why there is none.
 
         Args:
             target_frame: Frame into which points are transformed.
@@ -73,7 +73,7 @@ class TfListener:
             return NoTransform(TransformGap.UNUSABLE, str(error))
 
     def clear(self) -> None:
-        """Forget what moved; static transforms stay."""
+        """Forget moving transforms; static ones stay."""
         self._buffer.clear()
 
     def close(self) -> None:
@@ -81,12 +81,12 @@ class TfListener:
         self._listener.unregister()
 
     def _at(self, target: str, source: str, stamp_ns: int) -> tuple[NDArray[np.float64], int]:
-        """A transform and its stamp; 0 asks for the latest."""
+        """Return a transform and its stamp; stamp 0 means the latest."""
         stamped = self._buffer.lookup_transform(target, source, Time(nanoseconds=stamp_ns))
         return fields.transform_of(stamped, "/tf"), fields.stamp_ns(stamped)
 
     def _is_ahead(self, target: str, source: str, stamp_ns: int) -> bool:
-        """Whether a stamp is later than all that TF knows, so that the transform may still come."""
+        """Return whether a stamp is later than all that TF knows, so that the transform may still come."""
         try:
             return stamp_ns > self._at(target, source, 0)[1]
         except (self._tf2_ros.TransformException, FrameError):

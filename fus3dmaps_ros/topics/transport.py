@@ -1,4 +1,4 @@
-"""Middleware settings that large messages need."""
+"""Middleware settings for large messages."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _FAST_DDS_SETTINGS = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILE
 
 
 def enlarge_shared_memory() -> None:
-    """Give this process's publishers shared memory for images, unless the environment configures Fast DDS already.
+    """Give this process's publishers enough shared memory for images, unless the environment configures Fast DDS already.
 
-    Must come before the first ROS node of the process; other middlewares ignore it.
+    Must be called before the process makes its first ROS node; other middlewares ignore it.
     """
     if not any(name in os.environ for name in _FAST_DDS_SETTINGS):
         os.environ[_FAST_DDS_SETTINGS[0]] = str(_PROFILE)

@@ -36,15 +36,14 @@ def test_the_summary_counts_what_was_done(recording: Path):
     pipeline, progress = make_pipeline(), []
     summary = map_recording(recording, pipeline, lambda done, total: progress.append((done, total)))
     assert progress == [(done, 6) for done in range(1, 7)]
-    assert (summary.frames, summary.dense_keyframes, summary.instance_keyframes) == (6, 4, 3)
+    counts, stages_s = summary.ledger.counts(), summary.ledger.stages_s()
+    assert (counts.frames, counts.not_keyframes, counts.dense_keyframes, counts.instance_keyframes) == (6, 2, 4, 3)
     assert pipeline.stamp_ns == START_NS + 500_000_000
     # Grey wall, red and blue square in each instance keyframe; the wall touches the border all around and is left out.
-    assert summary.proposals == 6
-    assert {"decode", "patch_encoder", "dense_update", "segmentation", "crop_encoder", "instance_update"} <= set(
-        summary.stages_s
-    )
-    assert sum(summary.stages_s.values()) <= summary.duration_s
-    assert not summary.drops
+    assert counts.proposals == 6
+    assert {"decode", "patch_encoder", "dense_update", "segmentation", "crop_encoder", "instance_update"} <= set(stages_s)
+    assert sum(stages_s.values()) <= summary.duration_s
+    assert not summary.ledger.drops.counts()
 
 
 def test_the_map_is_fused_at_the_end(recording: Path):

@@ -18,7 +18,7 @@ from stand_ins import wall_frame
 from fus3dmaps_core.recordings.writer import RecordingWriter
 from fus3dmaps_msgs.srv import QueryText
 from fus3dmaps_ros.topics.conversions import from_cloud
-from fus3dmaps_ros.topics.outputs import LATCHED
+from fus3dmaps_ros.topics.qos import LATCHED
 
 START_NS = 1_700_000_000 * 10**9
 STEP_NS = 100_000_000

@@ -31,7 +31,7 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.saved_maps.directory import map_path
 from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText, SaveMap
-from fus3dmaps_ros.services.serving import SERVICE_QOS
+from fus3dmaps_ros.topics.qos import SERVICE_QOS
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
@@ -150,7 +150,7 @@ def heard(make_robot) -> Callable[..., tuple[Robot, list[tuple[str, str]]]]:
                 robot.makers[name] = encode
         robot.map(wall_frame(START_NS))
         drops: list[tuple[str, str]] = []
-        robot.mapper.drops.observe = lambda reason, sentence, number: drops.append((reason, sentence))
+        robot.mapper.drops.tell(lambda reason, sentence, number: drops.append((reason, sentence)))
         return robot, drops
 
     return make
@@ -210,7 +210,7 @@ def test_depth_without_a_reading_maps_nothing(robot) -> None:
     for value in (math.nan, math.inf, -1.0):
         blind = replace(blind, stamp_ns=blind.stamp_ns + SECOND_NS // 10, depth_m=np.full((480, 640), value, np.float32))
         robot.show(blind)
-    wait_until(lambda: robot.mapper.worker.counts().frames == 4 and not robot.mapper.worker.waiting, "all taken")
+    wait_until(lambda: robot.mapper.worker.ledger.counts().frames == 4 and not robot.mapper.worker.waiting, "all taken")
     check_it_lives(robot, START_NS + 20 * SECOND_NS)
     assert len(before["voxel_coordinates"]) < len(content(robot)["voxel_coordinates"])
 
@@ -225,7 +225,7 @@ def test_ten_times_the_rate_drops_the_oldest_and_counts_them(heard, monkeypatch)
         return process(frame)
 
     def counted() -> int:
-        return robot.mapper.worker.counts().frames
+        return robot.mapper.worker.ledger.counts().frames
 
     flooded = threading.Event()
     monkeypatch.setattr(robot.mapper.pipeline, "process", ten_times_slower)

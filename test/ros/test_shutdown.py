@@ -20,7 +20,7 @@ from fus3dmaps_core.frame import PosedFrame
 from fus3dmaps_core.saved_maps.directory import list_maps, map_path
 from fus3dmaps_core.saved_maps.storage import load_map
 from fus3dmaps_msgs.srv import QueryText
-from fus3dmaps_ros.topics.inputs import input_qos
+from fus3dmaps_ros.topics.qos import named_qos
 
 START_NS = 1_700_000_000 * 10**9
 FRAMES = [wall_frame(START_NS + number * 10**8, x_m=0.5 * number) for number in range(4)]
@@ -37,7 +37,7 @@ class Camera:
 
     def __init__(self, user: Node) -> None:
         self._user = user
-        qos = input_qos("transient_local", 100)  # Whatever discovery has not done yet, nothing is lost.
+        qos = named_qos("transient_local", 100)  # Whatever discovery has not done yet, nothing is lost.
         self._publishers = [(user.create_publisher(kind, topic, qos), make) for kind, topic, make in OUTLETS]
         self._client = user.create_client(QueryText, "/fus3dmaps/query_text")
 

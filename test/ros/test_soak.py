@@ -88,7 +88,7 @@ def test_nothing_grows(make_robot, tmp_path) -> None:
         f" threads {threading.active_count() - threads:+d}, handles {handles() - open_files:+d},"
         f" voxels {semantic_map.voxel_count - voxels:+d}"
     )
-    assert robot.mapper.worker.counts().dense_keyframes > 10
+    assert robot.mapper.worker.ledger.counts().dense_keyframes > 10
     assert threading.active_count() <= threads + 1
     assert handles() <= open_files + 2
     assert resident_bytes() - memory < MAY_GROW_BYTES

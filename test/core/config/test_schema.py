@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fus3dmaps_core.config.schema import Config, fields
+from fus3dmaps_core.config.section import Changes, when_it_changes
 from fus3dmaps_core.errors import ConfigError
 
 
@@ -35,6 +36,24 @@ def test_flat_keys_are_the_fields_and_round_trip():
     assert list(config.flat()) == list(fields())
     assert Config.from_flat(config.flat()) == config
     assert config.with_values({"query.top_k": 9}).flat() == {**config.flat(), "query.top_k": 9}
+
+
+def test_what_can_change_while_the_node_runs():
+    def keys(changes: Changes) -> set[str]:
+        return {key for key, field in fields().items() if when_it_changes(field) == changes}
+
+    assert keys(Changes.ANY_TIME) == {
+        *(f"segmenter.{name}" for name in ("min_area_px", "max_border_contact", "max_masks")),
+        *(f"keyframes.{layer}_{motion}" for layer in ("dense", "instance") for motion in ("translation_m", "rotation_rad")),
+        "map.memory_budget_mib",
+        "fusion.period_frames",
+        "query.top_k",
+        "query.min_voxels",
+        *(f"node.{name}_period_s" for name in ("publish", "status", "autosave")),
+        "node.service_timeout_s",
+        "node.map_directory",
+    }
+    assert keys(Changes.NEVER) == {"node.autostart"}
 
 
 def test_every_field_is_described():

@@ -26,7 +26,7 @@ from fus3dmaps_msgs.srv import Fuse, LoadMap, QueryText, SaveMap
 from fus3dmaps_ros.commands import cli
 from fus3dmaps_ros.player_node import play
 from fus3dmaps_ros.topics.conversions import from_cloud
-from fus3dmaps_ros.topics.outputs import LATCHED
+from fus3dmaps_ros.topics.qos import LATCHED
 
 NODE = Path(__file__).with_name("random_weights_node.py")
 FRAMES = 2  # Of the recording, as conftest.py writes it.
@@ -71,9 +71,10 @@ def test_a_recording_gives_the_same_map_twice(cached, recording, config, offline
     first, info = load_map(offline(name))
     pipeline = Pipeline.from_config(config(name))
     summary = map_recording(recording, pipeline)
-    assert summary.dense_keyframes == summary.instance_keyframes == summary.frames == FRAMES
-    assert summary.proposals == FRAMES * config(name).segmenter.max_masks
-    assert not summary.drops
+    counts = summary.ledger.counts()
+    assert counts.dense_keyframes == counts.instance_keyframes == counts.frames == FRAMES
+    assert counts.proposals == FRAMES * config(name).segmenter.max_masks
+    assert not summary.ledger.drops.counts()
     assert info.encoder == pipeline.trio.name == name
     assert first.dimension == pipeline.semantic_map.dimension == card(name).dimension
     assert_same_bytes(pipeline.semantic_map.export_state(), first.export_state())

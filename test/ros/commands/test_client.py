@@ -6,8 +6,6 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from sensor_msgs.msg import Image
-from stand_ins import COLORS, wall_frame
 
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.messages.fields import stamp_ns as stamp_of
@@ -61,19 +59,3 @@ def test_refusals_come_in_the_nodes_words(client: MapperClient, prompts, options
 def test_a_node_that_is_not_there_is_named():
     with MapperClient("/elsewhere") as client, pytest.raises(QueryError, match="/elsewhere"):
         client.wait_until_ready(0.5)
-
-
-def test_an_image_is_asked_for_and_maps_are_saved_and_loaded(make_robot, tmp_path):
-    robot = make_robot(**{"node.map_directory": str(tmp_path)})
-    robot.map(wall_frame(1_700_000_000 * 10**9))
-    red = Image(height=16, width=16, encoding="rgb8", step=48)
-    red.data.frombytes(bytes(COLORS["red"]) * 256)
-    with MapperClient(f"{robot.namespace}/fus3dmaps") as client:
-        (best,) = ranked_instances(client.ask_image(red, top_k=1))
-        np.testing.assert_allclose(best.centroid_m, [-0.4, 0.0, 2.0], atol=0.06)
-        assert client.save_map("kitchen").path == str(tmp_path / "kitchen")
-        assert client.load_map("kitchen").voxels == client.load_map().voxels > 0
-        with pytest.raises(QueryError, match="nowhere"):
-            client.load_map("nowhere")
-        with pytest.raises(QueryError, match="image"):
-            client.ask_image(Image())

@@ -163,7 +163,7 @@ def test_frames_that_wait_when_it_is_deactivated_are_not_mapped(make_robot) -> N
     assert change(robot, DEACTIVATE)
     gate.set()
     held.result(60)
-    assert robot.mapper.worker.counts().dense_keyframes == 1
+    assert robot.mapper.worker.ledger.counts().dense_keyframes == 1
     assert robot.mapper.worker.waiting == 0
 
 
@@ -188,7 +188,7 @@ def test_keyframe_thresholds_change_at_run_time(robot) -> None:
         assert robot.mapper.set_parameters([Parameter(name, value=value)])[0].successful
     robot.map(wall_frame(STAMP_NS + 10**9, x_m=0.5))  # The first after a change is a keyframe.
     robot.show(wall_frame(STAMP_NS + 2 * 10**9, x_m=1.0))
-    wait_until(lambda: robot.mapper.worker.counts().not_keyframes == 1, "too little motion now")
+    wait_until(lambda: robot.mapper.worker.ledger.counts().not_keyframes == 1, "too little motion now")
 
 
 def test_every_state_has_a_number_that_managers_know(managed) -> None:
@@ -262,8 +262,7 @@ def test_finalizing_gives_everything_back_once(fragile) -> None:
     node = fragile()
     node.bring_up()
     assert node.state == "active"
-    node.finalize()
-    node.finalize()
+    node.trigger_shutdown()
     assert (node.done, node.state) == (["configure", "activate", "deactivate", "cleanup"], "finalized")
 
 

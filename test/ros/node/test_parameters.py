@@ -12,8 +12,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from fus3dmaps_core.config.schema import Config, fields
+from fus3dmaps_core.config.section import Changes, when_it_changes
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_ros.node.parameters import FIXED, RUNTIME, declare_parameters, follow_changes, unknown_overrides
+from fus3dmaps_ros.node.parameters import declare_parameters, follow_changes, unknown_overrides
 
 
 @contextlib.contextmanager
@@ -37,9 +38,10 @@ def test_every_key_is_declared_with_default_and_description() -> None:
             assert (list(value) if isinstance(field.default, list) else value) == field.default
             descriptor = node.describe_parameter(key)
             assert descriptor.description == field.description
-            assert descriptor.read_only == (key in FIXED)
-            assert ("while the node is unconfigured" in descriptor.additional_constraints) == (key not in RUNTIME | FIXED)
-        assert set(fields()) >= RUNTIME | FIXED
+            changes = when_it_changes(field)
+            assert descriptor.read_only == (changes == Changes.NEVER)
+            told = "while the node is unconfigured" in descriptor.additional_constraints
+            assert told == (changes == Changes.UNCONFIGURED)
 
 
 def test_bounds_are_ranges() -> None:

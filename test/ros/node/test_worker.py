@@ -13,8 +13,9 @@ from robot import wait_until
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.ledger import Drops, Ledger
 from fus3dmaps_core.pipeline import FrameReport
-from fus3dmaps_ros.node.drops import DropLog
+from fus3dmaps_ros.node.drop_log import DropLog
 from fus3dmaps_ros.node.worker import FrameWorker
 
 
@@ -60,8 +61,8 @@ class Bench:
     def __init__(self) -> None:
         self.lines: list[str] = []
         self.pipeline = RecordingPipeline()
-        self.drops = DropLog(self.lines.append)
-        self.worker = FrameWorker(self.pipeline, 3, self.drops)
+        self.drops = Drops(DropLog(self.lines.append).report)
+        self.worker = FrameWorker(self.pipeline, 3, Ledger(self.drops))
 
     def hold_in(self, stamp_ns: int) -> None:
         """Have the thread stop inside a frame."""
@@ -89,7 +90,7 @@ def test_the_oldest_frame_goes_and_is_counted(bench) -> None:
     wait_until(lambda: bench.worker.stamp_ns == 7, "the newest frame mapped")
     assert bench.pipeline.events == [1, 5, 6, 7]
     assert bench.drops.counts() == {"queue_full": 3}
-    counts = bench.worker.counts()
+    counts = bench.worker.ledger.counts()
     assert (counts.frames, counts.dense_keyframes, counts.instance_keyframes) == (7, 4, 1)
 
 
@@ -106,7 +107,7 @@ def test_a_failing_frame_is_counted_and_the_next_one_mapped(bench) -> None:
 def test_frames_without_motion_are_not_decoded(bench) -> None:
     bench.pipeline.wanted = False
     bench.worker.offer(Frame(1, FrameError("must not be decoded")))
-    wait_until(lambda: bench.worker.counts().not_keyframes == 1, "frame skipped")
+    wait_until(lambda: bench.worker.ledger.counts().not_keyframes == 1, "frame skipped")
     assert not bench.drops.counts()
     assert bench.worker.stamp_ns == 0
 
@@ -116,7 +117,7 @@ def test_the_stamp_is_that_of_the_latest_mapped_frame_or_of_the_first_in_work(be
     bench.hold_in(1)
     assert bench.worker.stamp_ns == 1
     bench.pipeline.gate.set()
-    wait_until(lambda: bench.worker.counts().dense_keyframes == 1, "first frame mapped")
+    wait_until(lambda: bench.worker.ledger.counts().dense_keyframes == 1, "first frame mapped")
     bench.hold_in(2)
     assert bench.worker.stamp_ns == 1
     bench.pipeline.gate.set()
@@ -156,7 +157,7 @@ def test_an_observer_is_told_of_every_frame(bench) -> None:
         wait_until(lambda count=count: observer.events[count:][-1:] and observer.events[-1][0] == "finished", "finished")
     bench.pipeline.wanted = False
     bench.worker.offer(Frame(4))
-    wait_until(lambda: bench.worker.counts().not_keyframes == 1, "no keyframe")
+    wait_until(lambda: bench.worker.ledger.counts().not_keyframes == 1, "no keyframe")
     wait_until(lambda: len(observer.events) == 10, "all told")
     failed = ("finished", [], 0)
     assert observer.events == [
@@ -174,11 +175,11 @@ def test_an_observer_is_told_of_every_frame(bench) -> None:
 
 
 def test_the_latest_keyframes_tell_how_long_each_stage_takes(bench) -> None:
-    assert bench.worker.stage_times() == {}
+    assert bench.worker.ledger.stage_times() == {}
     for stamp_ns in (1, 2):
         bench.worker.offer(Frame(stamp_ns))
     wait_until(lambda: bench.worker.stamp_ns == 2, "mapped")
-    (stage,) = bench.worker.stage_times().items()
+    (stage,) = bench.worker.ledger.stage_times().items()
     assert stage[0] == "decode"
     assert 0 <= stage[1].mean_s <= stage[1].max_s
 
@@ -245,4 +246,4 @@ def test_stopping_does_not_wait_for_a_stuck_frame_and_cancels_calls(bench) -> No
 
 
 def test_a_worker_that_never_started_stops() -> None:
-    assert FrameWorker(RecordingPipeline(), 1, DropLog(print)).stop(0.01)
+    assert FrameWorker(RecordingPipeline(), 1, Ledger()).stop(0.01)

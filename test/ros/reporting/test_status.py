@@ -21,7 +21,7 @@ def test_the_status_tells_what_came_what_was_lost_and_what_the_map_takes(make_ro
     robot.publishers["rgb"].publish(broken)
     wait_until(lambda: robot.mapper.drops.counts(), "a drop")
     now_s = time.monotonic()
-    robot.mapper._watch.diagnosis._clock = lambda: now_s  # Rates are those of the last seconds: let none pass.
+    robot.mapper._monitor.diagnosis._clock = lambda: now_s  # Rates are those of the last seconds: let none pass.
     received = robot.listen(MapperStatus, "status")
     status = wait_until(lambda: next((each for each in received if each.drop_reasons), None), "status received")
 
@@ -54,7 +54,7 @@ def test_an_unconfigured_node_reports_too(make_robot) -> None:
 
 def test_topics_without_a_message_are_problems_while_active(robot) -> None:
     robot.publishers["info"].publish(camera_info_message(wall_frame(STAMP_NS)))
-    diagnosis = robot.mapper._watch.diagnosis
+    diagnosis = robot.mapper._monitor.diagnosis
     wait_until(lambda: diagnosis.rates_hz()["rgb/camera_info"] > 0, "camera info came")
     diagnosis._clock = lambda: time.monotonic() + 6.0
     silent = [problem for problem in robot.mapper.status_message().problems if "no message on" in problem]

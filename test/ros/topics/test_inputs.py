@@ -27,8 +27,10 @@ from sensor_msgs.msg import CameraInfo, Image
 from stand_ins import wall_frame
 
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_ros.node.drops import DropLog
-from fus3dmaps_ros.topics.inputs import Inputs, input_qos
+from fus3dmaps_core.ledger import Drops
+from fus3dmaps_ros.node.drop_log import DropLog
+from fus3dmaps_ros.topics.inputs import Inputs
+from fus3dmaps_ros.topics.qos import named_qos
 
 SECOND_NS = 10**9
 START_NS = 1_700_000_000 * SECOND_NS
@@ -151,7 +153,7 @@ def test_changes_of_the_camera_are_counted_and_followed(robot) -> None:
 def test_each_input_has_the_qos_of_its_profile(profile, reliability, durability) -> None:
     with node_alone() as node:
         config = Config().with_values({"input.depth_qos": profile})
-        inputs = Inputs(node, config, lambda paired: None, DropLog(print))
+        inputs = Inputs(node, config, lambda paired: None, Drops())
         found = {}
         for topic in ("rgb/image", "depth/image", "rgb/camera_info", "pose"):
             (endpoint,) = node.get_subscriptions_info_by_topic(f"/{topic}")
@@ -163,9 +165,9 @@ def test_each_input_has_the_qos_of_its_profile(profile, reliability, durability)
 
 def test_best_available_takes_what_the_publisher_offers() -> None:
     with node_alone() as node:
-        node.create_publisher(Image, "depth/image", input_qos("sensor_data", 1))
+        node.create_publisher(Image, "depth/image", named_qos("sensor_data", 1))
         config = Config().with_values({"input.depth_qos": "best_available"})
-        inputs = Inputs(node, config, lambda paired: None, DropLog(print))
+        inputs = Inputs(node, config, lambda paired: None, Drops())
         (endpoint,) = node.get_subscriptions_info_by_topic("/depth/image")
         assert endpoint.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
         assert endpoint.qos_profile.durability == DurabilityPolicy.VOLATILE
@@ -174,11 +176,11 @@ def test_best_available_takes_what_the_publisher_offers() -> None:
 
 def test_a_latched_camera_model_is_heard_by_who_comes_late() -> None:
     with node_alone() as node:
-        latched = node.create_publisher(CameraInfo, "rgb/camera_info", input_qos("transient_local", 1))
+        latched = node.create_publisher(CameraInfo, "rgb/camera_info", named_qos("transient_local", 1))
         latched.publish(camera_info_message(wall_frame(START_NS)))
         config = Config().with_values({"input.camera_info_qos": "transient_local"})
         heard: list[tuple[str, int]] = []
-        Inputs(node, config, lambda paired: None, DropLog(print), lambda topic, stamp_ns: heard.append((topic, stamp_ns)))
+        Inputs(node, config, lambda paired: None, Drops(), lambda topic, stamp_ns: heard.append((topic, stamp_ns)))
         with CallbackThreads(node.context, node):
             wait_until(lambda: heard == [("rgb/camera_info", START_NS)], "camera model heard")
 

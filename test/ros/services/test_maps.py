@@ -337,7 +337,7 @@ def test_autosave_can_be_switched_on_while_the_node_runs_and_clean_up_saves_a_la
     robot.map(wall_frame(STAMP_NS))
     assert robot.mapper.set_parameters([Parameter("node.autosave_period_s", value=3600.0)])[0].successful
     state = state_of(robot)
-    robot.mapper.finalize()
+    robot.mapper.trigger_shutdown()
     assert_same_bytes(load_map(maps / NAMES[0])[0].export_state(), state)
 
 
@@ -353,7 +353,7 @@ def test_a_last_save_that_takes_too_long_is_left_to_itself_and_completes(make_ro
     state = state_of(robot)
     monkeypatch.setattr(map_store, "save_map", slow)
     limit(robot, 0.2)
-    robot.mapper.finalize()
+    robot.mapper.trigger_shutdown()
     assert robot.mapper.session is None
     assert "the last save goes on" in capfd.readouterr().err
     assert list_maps(maps) == []

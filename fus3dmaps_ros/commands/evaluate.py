@@ -1,4 +1,4 @@
-"""``fus3dmaps evaluate``: simulated buildings or a published dataset, as records, tables and a report. Needs no ROS."""
+"""``fus3dmaps evaluate``: quality figures of simulated buildings or a published dataset. Needs no ROS."""
 
 from __future__ import annotations
 
@@ -9,15 +9,20 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import ConfigError
-from fus3dmaps_lab.evaluation.records import CurvePoint, Record
+from fus3dmaps_ros.commands.settings import DatasetOptions, ParamsFile, Settings, configuration, pairs
+from fus3dmaps_ros.commands.terminal import OUT, progress
+
+if TYPE_CHECKING:
+    from fus3dmaps_lab.evaluation.records import CurvePoint, Record
 
 SIMULATION = "simulation"
 _SIMULATED = (
@@ -30,16 +35,16 @@ _SIMULATED = (
     "map.",
     "fusion.",
 )
-"""Keys, or their beginnings, that mean something to simulated buildings."""
+"""Keys, or their beginnings, of the parameters that have an effect on simulated buildings."""
 _HEADLINE = ("mIoU", "f-mIoU", "accuracy")
 
 Progress = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-"""Shows a bar with this label."""
+"""Shows a progress bar with this label."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What is evaluated.
+    """What to evaluate.
 
     Attributes:
         target: ``simulation``, or a dataset's layout.
@@ -47,7 +52,7 @@ class Evaluation:
         seeds: How many buildings are simulated.
         quick: Smaller buildings, and no sweeps in the report.
         jobs: How many buildings are studied at once; 0 for as many as there are processors.
-        options: Of the dataset, e.g. its scene.
+        options: Options of the dataset, e.g. its scene.
     """
 
     target: str
@@ -63,9 +68,9 @@ class Destination:
     """Where the results go.
 
     Attributes:
-        json_file: Records, if wanted.
-        report: Directory of the report, if wanted.
-        console: Headline figures.
+        json_file: File of the records; None for no file.
+        report: Directory of the report; None for no report.
+        console: Shows the headline figures.
     """
 
     json_file: Path | None
@@ -73,18 +78,35 @@ class Destination:
     console: Console
 
 
+def evaluate(
+    target: Annotated[str, typer.Argument(help="simulation, or a dataset's layout as for convert.")] = "simulation",
+    directory: Annotated[Path | None, typer.Argument(help="The dataset's folder.")] = None,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="How many buildings are simulated.")] = 5,
+    quick: Annotated[bool, typer.Option("--quick", help="Smaller buildings, no sweeps.")] = False,
+    jobs: Annotated[int, typer.Option("--jobs", min=0, help="Buildings at once; 0: one for each processor.")] = 0,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write a JSON list of records to this file.")] = None,
+    report: Annotated[Path | None, typer.Option("--report", help="Write tables and plots into this directory.")] = None,
+    options: DatasetOptions = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Measure how good maps are: on simulated buildings, or on a labelled dataset."""
+    request = Evaluation(target, directory, seeds, quick, jobs, pairs("--option", options))
+    evaluate_target(request, configuration(params_file, settings), Destination(json_file, report, OUT), progress)
+
+
 def evaluate_target(request: Evaluation, config: Config, destination: Destination, progress: Progress) -> None:
     """Evaluate, print the headline figures and write what was asked for.
 
     Args:
-        request: What is evaluated.
-        config: Of the maps; simulated buildings come with models, images and topics of their own.
+        request: What to evaluate.
+        config: Parameters of the maps; simulated buildings bring their own models, images and topics.
         destination: Where the results go.
-        progress: Shows how far it is.
+        progress: Shows progress bars.
 
     Raises:
-        ConfigError: A dataset has no directory, the simulation has one or is given a parameter that means nothing to it, or
-            the plots' package is missing.
+        ConfigError: A dataset has no directory, the simulation has one or is given a parameter that has no effect on it, or
+            the package for plots is missing.
         StorageError: A file cannot be written.
     """
     from fus3dmaps_lab.evaluation.records import write_records
@@ -114,7 +136,7 @@ def evaluate_target(request: Evaluation, config: Config, destination: Destinatio
 
 
 def _of_maps(config: Config) -> dict[str, Any]:
-    """What of a configuration is not its default and says how a simulated building is mapped."""
+    """Return the values that differ from their default; refuse those with no effect on simulated buildings."""
     defaults = Config().flat()
     changed = {key: value for key, value in config.flat().items() if value != defaults[key]}
     for key in changed:

@@ -1,4 +1,4 @@
-"""``fus3dmaps export``: the networks of an encoder trio as checked ONNX files, and as engines where TensorRT is installed.
+"""``fus3dmaps export``: writes the networks of an encoder trio as checked ONNX files, and as TensorRT engines if possible.
 
 Needs no ROS.
 """
@@ -7,34 +7,63 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.console import Console
 
 from fus3dmaps_core.config.schema import Config, EncoderConfig
 from fus3dmaps_core.errors import EncoderError
-from fus3dmaps_core.runtimes.exporting import ExportedGraph
+from fus3dmaps_ros.commands.settings import ParamsFile, Settings, configuration, directory
+from fus3dmaps_ros.commands.terminal import OUT
+
+if TYPE_CHECKING:
+    from fus3dmaps_core.runtimes.exporting import ExportedGraph
 
 _MIB = 1 << 20
 
 
-def export_encoders(config: Config, directory: Path, console: Console, *, as_json: bool = False) -> None:
-    """Export the graphs of both image encoders, check them, and print what became of each.
+def export(
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out",
+            parser=directory,
+            metavar="DIRECTORY",
+            help="Directory for graphs and engines; later encoder.graph_directory.",
+        ),
+    ],
+    encoder: Annotated[str | None, typer.Option("--encoder", help="Which encoders; the same as encoder.name.")] = None,
+    precision: Annotated[str | None, typer.Option("--precision", help="fp32, fp16 or bf16; as encoder.precision.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON object.")] = False,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """Write the networks of encoders as checked ONNX files, and build TensorRT engines where TensorRT is installed."""
+    chosen = {"encoder.name": encoder, "encoder.precision": precision}
+    config = configuration(params_file, settings).with_values(
+        {key: value for key, value in chosen.items() if value is not None}
+    )
+    export_encoders(config, out, OUT, as_json=as_json)
 
-    Without TensorRT, or without a GPU, the ONNX files are all there is, and a line says what is missing.
+
+def export_encoders(config: Config, directory: Path, console: Console, *, as_json: bool = False) -> None:
+    """Export the graphs of both image encoders, check them, and print the figures of each.
+
+    Without TensorRT, or without a GPU, only ONNX files are written, and a line says what is missing.
 
     Args:
-        config: ``encoder.name``, ``weights``, ``device`` and ``precision`` say what is exported, ``image.height`` and
-            ``width`` for which images. Engines are built on the device where it is a CUDA device, else on the first one.
-        directory: Where the files go; ``encoder.graph_directory`` of who will run them.
-        console: Where it is printed.
-        as_json: Print one JSON object, ``graphs`` and ``engines``, in place of lines.
+        config: ``encoder.name``, ``weights``, ``device`` and ``precision`` say what to export, ``image.height`` and
+            ``width`` for which images. Engines are built on the device if it is a CUDA device, else on the first one.
+        directory: Where the files go; later ``encoder.graph_directory`` of the node that runs them.
+        console: Gets the output.
+        as_json: Print one JSON object, ``graphs`` and ``engines``, instead of lines.
 
     Raises:
         EncoderError: The trio or its weights are missing, an encoder has no graph, the directory cannot be written, memory
             does not suffice for images of that size, or a graph is too far from torch.
     """
-    # Seconds of import, which only those who export pay.
+    # These take seconds to import.
     from fus3dmaps_core.encoders.registry import load_trio
     from fus3dmaps_core.runtimes.exporting import export_graph, graph_encoders
     from fus3dmaps_core.runtimes.image_memory import naming_image_size
@@ -56,7 +85,7 @@ def export_encoders(config: Config, directory: Path, console: Console, *, as_jso
 
 
 def _build_engines(encoder: EncoderConfig, directory: Path, exported: list[ExportedGraph]) -> tuple[list[Path], str]:
-    """Engines of the graphs, or why there are none."""
+    """Build the engines of the graphs; return them, and if there are none a line that says why."""
     import torch
 
     from fus3dmaps_core.runtimes.packages import import_tensorrt

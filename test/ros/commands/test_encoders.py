@@ -11,6 +11,7 @@ import torch
 from fus3dmaps_core.encoders import registry
 from fus3dmaps_core.encoders.cards import EncoderCard
 from fus3dmaps_ros.commands import cli
+from fus3dmaps_ros.commands.terminal import OUT
 
 KEYS = {
     "name",
@@ -41,7 +42,7 @@ def run(monkeypatch, capsys):
 
     def command(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["fus3dmaps", "encoders", *map(str, arguments)])
-        monkeypatch.setattr(cli._out, "_width", 300)
+        monkeypatch.setattr(OUT, "_width", 300)
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
             cli.main()

@@ -1,4 +1,4 @@
-"""The services that ask: ``~/query_text``, ``~/query_image``, ``~/label_map`` and ``~/list_instances``."""
+"""The services that answer: ``~/query_text``, ``~/query_image``, ``~/label_map`` and ``~/list_instances``."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from fus3dmaps_ros.topics.outputs import Outputs
 
 
 class QueryServices(ServiceGroup):
-    """Answers questions while mapping goes on; none of them changes the map."""
+    """Answers questions while mapping goes on, without changing the map."""
 
     def __init__(self, node: Node, sessions: SessionHolder, outputs: Outputs, read: Callable[[], Config]) -> None:
         """Offer the services.
 
         Args:
             node: Owner of the services.
-            sessions: Whose map and encoders answer.
+            sessions: Has the map and the encoders.
             outputs: Publishes answers.
-            read: Gives the configuration in force.
+            read: Returns the current configuration.
         """
         super().__init__(node, read)
         self._sessions = sessions
@@ -49,27 +49,28 @@ class QueryServices(ServiceGroup):
 
     def _query_text(self, request: Any, response: Any, call: Call) -> str:
         session = self._sessions.require()
-        query = self._query(request, list(request.prompts))
-        query.check()
-        # Before the map is read: what it holds may be newer than the stamp, never older.
-        header = self._outputs.header()
-        semantic_map, logit_scale = session.pipeline.semantic_map, session.pipeline.trio.logit_scale
-        found = call.in_time(lambda: answer_query(semantic_map, session.text, query, logit_scale))
-        return self._fill(request, response, header, found)
+        query, pipeline = self._to_query(request, list(request.prompts)), session.pipeline
+        return self._answer(
+            request,
+            response,
+            call,
+            lambda: answer_query(pipeline.semantic_map, session.text, query, pipeline.trio.logit_scale),
+        )
 
     def _query_image(self, request: Any, response: Any, call: Call) -> str:
         session = self._sessions.require()
-        query = self._query(request, [IMAGE_PROMPT])
-        query.check()
+        query, pipeline = self._to_query(request, [IMAGE_PROMPT]), session.pipeline
         rgb = decode_color(request.image, "image")
-        # By the mapping thread: its encoder need not be thread-safe, and a second copy would not fit the GPU.
-        crop = session.pipeline.trio.crop
+        # In the mapping thread: the encoder need not be thread-safe, and a second one might not fit on the GPU.
+        crop = pipeline.trio.crop
         encoded = session.worker.between_frames(lambda: embed_image(crop, rgb), changes=False)
         embedding = call.in_time(lambda: between_frames(encoded, call.deadline))
-        header = self._outputs.header()
-        semantic_map, logit_scale = session.pipeline.semantic_map, session.pipeline.trio.logit_scale
-        found = call.in_time(lambda: answer_image_query(semantic_map, embedding, session.text, query, logit_scale))
-        return self._fill(request, response, header, found)
+        return self._answer(
+            request,
+            response,
+            call,
+            lambda: answer_image_query(pipeline.semantic_map, embedding, session.text, query, pipeline.trio.logit_scale),
+        )
 
     def _label_map(self, request: Any, response: Any, call: Call) -> str:
         session = self._sessions.require()
@@ -90,10 +91,10 @@ class QueryServices(ServiceGroup):
         response.instances = conversions.to_instances(header, instances, min_voxels)
         return f"{len(response.instances)} of {len(instances.ids)} instances occupy at least {min_voxels} voxels"
 
-    def _query(self, request: Any, prompts: Sequence[str]) -> TextQuery:
-        """A threshold of 0 leaves nothing out, a top_k of 0 takes ``query.top_k``."""
+    def _to_query(self, request: Any, prompts: Sequence[str]) -> TextQuery:
+        """Read a checked query from a request: a threshold of 0 leaves nothing out, a top_k of 0 takes ``query.top_k``."""
         settings = self._read().query
-        return TextQuery(
+        query = TextQuery(
             prompts,
             tuple(request.negative_prompts),
             request.layer or DEFAULT_LAYER,
@@ -101,8 +102,14 @@ class QueryServices(ServiceGroup):
             request.top_k or settings.top_k,
             settings.min_voxels,
         )
+        query.check()
+        return query
 
-    def _fill(self, request: Any, response: Any, header: Any, found: QueryAnswer) -> str:
+    def _answer(self, request: Any, response: Any, call: Call, find: Callable[[], QueryAnswer]) -> str:
+        """Find the answer, fill it into the response, and publish it if the request says so."""
+        # Before the map is read, so that its content may be newer than the stamp but never older.
+        header = self._outputs.header()
+        found = call.in_time(find)
         response.instances = [conversions.to_instance(header, instance) for instance in found.instances]
         response.similarity = conversions.to_similarity_cloud(header, found)
         if request.publish:

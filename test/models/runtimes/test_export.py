@@ -16,7 +16,7 @@ from fus3dmaps_core.config.schema import Config, EncoderConfig, ImageConfig
 from fus3dmaps_core.errors import EncoderError
 from fus3dmaps_core.runtimes import exporting
 from fus3dmaps_core.runtimes.acceleration import accelerate
-from fus3dmaps_ros.commands.export_command import export_encoders
+from fus3dmaps_ros.commands.export import export_encoders
 
 
 @pytest.fixture(autouse=True)
@@ -85,7 +85,7 @@ def test_with_both_an_engine_is_built_of_each_graph(tmp_path, monkeypatch):
         return None, path.with_suffix(".engine")
 
     monkeypatch.setitem(sys.modules, "tensorrt", TensorRT())
-    monkeypatch.setattr("fus3dmaps_ros.commands.export_command._has_gpu", lambda: True)
+    monkeypatch.setattr("fus3dmaps_ros.commands.export._has_gpu", lambda: True)
     monkeypatch.setattr("fus3dmaps_core.runtimes.tensorrt_network.engine_of", engine_of)
     lines = export(tmp_path, "fp16").splitlines()
     assert built == [(kind, "cuda", "fp16", tmp_path) for kind in ("patch", "crop")]

@@ -1,4 +1,4 @@
-"""Tells the diagnosis what happens in the node, while the node maps."""
+"""The link between the active node and the diagnosis of its health."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from fus3dmaps_ros.node.session import Session
 from fus3dmaps_ros.reporting.diagnostics import Diagnostics, publishers_of
 
 
-class Watch:
-    """From activation to deactivation: follows inputs and frames, and publishes ``/diagnostics``."""
+class HealthMonitor:
+    """Follows inputs, frames and drops while the node is active, and publishes ``/diagnostics``."""
 
     def __init__(self, node: Node, config: Config, streams: Sequence[Stream], session: Session) -> None:
-        """Begin to watch.
+        """Start to publish.
 
         Args:
-            node: Owner of the publisher; its clock is what stamps are compared with.
-            config: The configuration in force.
+            node: Owner of the publisher; stamps are compared with its clock.
+            config: The current configuration.
             streams: The inputs.
-            session: Its map is reported.
+            session: Has the map.
         """
         self._node = node
         self._config = config
@@ -52,15 +52,15 @@ class Watch:
         )
 
     def arrived(self, topic: str, stamp_ns: int) -> None:
-        """A message came on one of the streams."""
+        """Note that a message with this stamp came on one of the streams."""
         self.diagnosis.arrived(topic, stamp_ns, self._node.get_clock().now().nanoseconds)
 
     def offered(self, waiting: int) -> None:
-        """A frame was queued, and so many wait now."""
+        """Note that a frame was queued; ``waiting`` frames wait now."""
         self.diagnosis.offered(waiting)
 
     def decoded(self, paired: PairedMessages, frame: PosedFrame) -> None:
-        """A keyframe was decoded."""
+        """Note that a keyframe was decoded."""
         if self._cameras.get(paired.rgb_topic) != paired.intrinsics:
             self._cameras[paired.rgb_topic] = paired.intrinsics
             self.diagnosis.camera(paired.rgb_topic, paired.intrinsics)
@@ -73,20 +73,20 @@ class Watch:
         )
 
     def finished(self, durations_s: Mapping[str, float], waiting: int) -> None:
-        """A frame was dealt with."""
+        """Note that a frame is done."""
         self.diagnosis.finished(durations_s, waiting)
 
     def dropped(self, reason: str, sentence: str, number: int) -> None:
-        """Messages or frames were dropped."""
+        """Note that messages or frames were dropped."""
         self.diagnosis.dropped(reason, sentence, number)
 
     def problems(self) -> list[Problem]:
-        """What is wrong now."""
+        """Return the current problems."""
         offers = {topic: publishers_of(self._node, topic) for topic in self._topics}
         return self.diagnosis.problems(offers, self.memory())
 
     def memory(self) -> list[MemoryState]:
-        """How full the map's memory is, and the GPU where the encoders use one."""
+        """Return how full the map's memory is, and that of the GPU if the encoders use one."""
         config = self._config
         used = sum(self._session.pipeline.semantic_map.nbytes().values())
         states = [MemoryState(f"map on {config.map.device}", used, round(config.map.memory_budget_mib * MIB))]
@@ -97,7 +97,7 @@ class Watch:
         return states
 
     def close(self) -> None:
-        """Take the topic back."""
+        """Remove the topic."""
         self._published.close()
 
     def _sizes(self) -> MapSizes:

@@ -16,8 +16,7 @@ from fus3dmaps_core.errors import ConfigError, Fus3dmapsError
 from fus3dmaps_lab.evaluation import simulation_runs
 from fus3dmaps_lab.evaluation.records import LAYERS
 from fus3dmaps_lab.evaluation.simulation import Study
-from fus3dmaps_ros.commands import evaluate_command
-from fus3dmaps_ros.commands.evaluate_command import Destination, Evaluation, evaluate_target
+from fus3dmaps_ros.commands.evaluate import Destination, Evaluation, evaluate_target
 
 
 @contextmanager
@@ -101,6 +100,6 @@ def test_an_option_that_the_dataset_does_not_know_is_refused(tmp_path) -> None:
 
 
 def test_plots_need_their_package(monkeypatch, tmp_path) -> None:
-    monkeypatch.setattr(evaluate_command, "find_spec", lambda name: None)
+    monkeypatch.setattr("fus3dmaps_ros.commands.evaluate.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"fus3dmaps_ros\[evaluation\]"):
         run("simulation", report=tmp_path)

@@ -1,4 +1,4 @@
-"""The services that command: ``~/fuse``, ``~/reset``, ``~/save_map`` and ``~/load_map``."""
+"""The services that change, save or load the map: ``~/fuse``, ``~/reset``, ``~/save_map`` and ``~/load_map``."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ class MapServices(ServiceGroup):
 
         Args:
             node: Owner of the services.
-            sessions: Whose map.
-            outputs: Its latched answers are cleared when their map is gone.
-            read: Gives the configuration in force.
-            forget_inputs: Has the inputs forget the messages that wait, on a reset.
+            sessions: Has the map.
+            outputs: Its latched answers are cleared when their map is replaced.
+            read: Returns the current configuration.
+            forget_inputs: Makes the inputs forget the messages that wait; called by a reset.
         """
         super().__init__(node, read)
         self._sessions = sessions

@@ -1,35 +1,56 @@
-"""``fus3dmaps encoders``: which encoders there are, under which licences, and what of them is installed. Needs no ROS."""
+"""``fus3dmaps encoders``: a list of all encoders, their licences, and which of their parts are installed. Needs no ROS."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import typer
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from fus3dmaps_core.config.schema import Config
-from fus3dmaps_core.encoders import registry
-from fus3dmaps_core.encoders.catalogue import Entry, Part, catalogue
+from fus3dmaps_ros.commands.settings import ParamsFile, Settings, configuration
+from fus3dmaps_ros.commands.terminal import OUT
+
+if TYPE_CHECKING:
+    from fus3dmaps_core.encoders.catalogue import Entry, Part
 
 _HEADINGS = ("name", "d", "λ", "patches", "code", "weights", "installed")
+
+
+def encoders(
+    as_json: Annotated[bool, typer.Option("--json", help="Print a JSON list.")] = False,
+    weights: Annotated[str | None, typer.Option("--weights", help="Where weights are; the same as encoder.weights.")] = None,
+    params_file: ParamsFile = None,
+    settings: Settings = None,
+) -> None:
+    """List the encoders: their space, their licences, and what of them is installed."""
+    config = configuration(params_file, settings)
+    if weights is not None:
+        config = config.with_values({"encoder.weights": weights})
+    list_encoders(config, OUT, as_json=as_json)
 
 
 def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
     """Print every encoder trio.
 
     Args:
-        config: Says where weights are, and the size of the images that the patch grid is for.
-        console: Where the table goes; JSON goes to standard output as it is.
-        as_json: Print a JSON list in place of the table.
+        config: Says where weights are, and for which image size patch grids are listed.
+        console: Gets the table; JSON goes directly to standard output.
+        as_json: Print a JSON list instead of the table.
 
     Raises:
         EncoderError: ``encoder.weights`` names neither a file or directory nor a repository, or ``encoder.name`` no encoder.
     """
+    # These take seconds to import.
+    from fus3dmaps_core.encoders import registry
+    from fus3dmaps_core.encoders.catalogue import catalogue
+
     if config.encoder.name not in registry.names():
         registry.card(config.encoder.name)  # Refuses it, with the names that are known.
     entries = catalogue(config.encoder.weights, config.encoder.name)
@@ -43,12 +64,12 @@ def list_encoders(config: Config, console: Console, *, as_json: bool) -> None:
 
 
 def as_dict(entry: Entry, height: int, width: int) -> dict[str, Any]:
-    """A trio as JSON has it; every key is there for every trio.
+    """Return a trio as a JSON object; every trio has every key.
 
     Args:
         entry: The trio.
-        height: Of the images that the patch grid is for, pixels.
-        width: Of these.
+        height: Height of the images that the patch grid is for, pixels.
+        width: Width of these images, pixels.
     """
     card = entry.card
     return {
@@ -110,7 +131,7 @@ def _table(entries: Sequence[Entry], height: int, width: int) -> Table:
 
 
 def _lacking(entry: Entry) -> str:
-    """How much is missing, for the table."""
+    """Say how much of a trio is missing, for the table."""
     counts = {
         "package": sum(bool(package.problem) for package in entry.packages),
         "file": sum(part.path is None for part in entry.weights),
@@ -122,7 +143,7 @@ def _lacking(entry: Entry) -> str:
 
 
 def _advice(entries: Sequence[Entry], config: Config) -> list[str]:
-    """What is missing of which trio, and what to do about it."""
+    """Return lines that say what each trio lacks, and what to do about it."""
     lines, extras = [], set()
     for entry in entries:
         packages = [f"{package.name} {package.problem}" for package in entry.packages if package.problem]
