@@ -7,6 +7,8 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+from fus3dmaps_core.errors import FrameError
+
 _TIMED_KEYFRAMES = 100
 
 DropObserver = Callable[[str, str, int], object]
@@ -41,6 +43,10 @@ class Drops:
             observers = self._observers
         for observe in observers:
             observe(reason, sentence, number)
+
+    def add_error(self, error: FrameError) -> None:
+        """Count one drop, for the reason and with the sentence of an error."""
+        self.add(error.reason, str(error))
 
     def counts(self) -> Counter[str]:
         """Return the number of drops by reason, in the order in which reasons first occurred."""

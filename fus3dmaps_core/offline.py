@@ -56,7 +56,7 @@ def map_recording(
             step.run(paired)
             if on_progress is not None:
                 on_progress(done, len(source))
-        source.pairer.hand_over_drops(ledger.drops)
+        source.pairer.drops.pour_into(ledger.drops)
     if not ledger.counts().dense_keyframes:
         latest = ledger.drops.latest()
         causes = "; ".join(f"{reason} ({count}): {latest[reason]}" for reason, count in ledger.drops.counts().items())

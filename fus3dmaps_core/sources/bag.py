@@ -74,7 +74,7 @@ class BagSource:
             try:
                 message = self._reader.deserialize(raw)
             except RecordingError as error:
-                pairer.drop(FrameError(str(error), reason="bad_message"))
+                pairer.drops.add_error(FrameError(str(error), reason="bad_message"))
                 continue
             add[raw.topic](message)
             yield from pairer.poll()
@@ -137,6 +137,6 @@ def _absolute(topic: str) -> str:
 def _transform_adder(tree: TransformTree, pairer: FramePairer, topic: str) -> Callable[[Any], None]:
     def add(message: Any) -> None:
         for refused in tree.add(message, topic, static=topic == "/tf_static"):
-            pairer.drop(refused)
+            pairer.drops.add_error(refused)
 
     return add

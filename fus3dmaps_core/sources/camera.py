@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import FrameError
+from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages import fields
 from fus3dmaps_core.messages.images import check_color, check_depth, image_size
 from fus3dmaps_core.sources.paired import CameraModel, PairedMessages, UnregisteredDepth, check_size
 from fus3dmaps_core.sources.poses import FOREVER_NS, Moment, Mounting, PoseProvider
 from fus3dmaps_core.sources.streams import CameraTopics, Stream, image_type
-from fus3dmaps_core.sources.timeline import Tally, Timeline, seconds
+from fus3dmaps_core.sources.timeline import Timeline, seconds
 
 _ASPECT_TOLERANCE = 0.01
 
@@ -32,10 +33,10 @@ class _Stamped:
 class _Models:
     """The camera models of a ``camera_info`` topic over time."""
 
-    def __init__(self, config: InputConfig, topic: str, tally: Tally) -> None:
+    def __init__(self, config: InputConfig, topic: str, drops: Drops) -> None:
         self.topic = topic
         self._rectify = config.rectify
-        self._tally = tally
+        self._drops = drops
         self._models: deque[tuple[int, CameraModel]] = deque()
 
     def add(self, message: Any) -> None:
@@ -43,7 +44,7 @@ class _Models:
             distortion = fields.to_distortion(message, self.topic) if self._rectify else None
             model = CameraModel(fields.to_intrinsics(message, self.topic), distortion)
         except FrameError as error:
-            self._tally.drop(error)
+            self._drops.add_error(error)
             return
         if self._models:
             known = self._models[-1][1]
@@ -51,7 +52,7 @@ class _Models:
                 return
             old, new = known.intrinsics, model.intrinsics
             changes = f"from {old} to {new}" if old != new else f"in its lens's distortion, now {distortion}"
-            self._tally.drop(FrameError(f"{self.topic}: camera model changed {changes}", reason="intrinsics_changed"))
+            self._drops.add("intrinsics_changed", f"{self.topic}: camera model changed {changes}")
         stamp_ns = fields.stamp_ns(message)
         while self._models and self._models[-1][0] >= stamp_ns:
             self._models.pop()
@@ -85,7 +86,7 @@ class CameraPairer:
         mounting: Mounting,
         camera_frame: str,
         timeline: Timeline,
-        tally: Tally,
+        drops: Drops,
     ) -> None:
         """Start empty.
 
@@ -96,7 +97,7 @@ class CameraPairer:
             mounting: Mounting of the camera on the body.
             camera_frame: Its optical frame in TF; if empty, the frame named by the images.
             timeline: Stamps of all inputs.
-            tally: Drops of all inputs.
+            drops: Counts the drops of all inputs.
         """
         self._config = config
         self._topics = topics
@@ -104,14 +105,14 @@ class CameraPairer:
         self._mounting = mounting
         self._camera_frame = camera_frame
         self._timeline = timeline
-        self._tally = tally
+        self._drops = drops
         self._tolerance_ns = round(config.sync_tolerance_s * 1e9)
         self._max_wait_ns = round(config.max_wait_s * 1e9)
         self._rgb: deque[_Stamped] = deque()
         self._depth: deque[_Stamped] = deque()
         self._frames: dict[str, str] = {}
-        self._models = _Models(config, topics.camera_info, tally)
-        self._depth_models = None if topics.depth_camera_info is None else _Models(config, topics.depth_camera_info, tally)
+        self._models = _Models(config, topics.camera_info, drops)
+        self._depth_models = None if topics.depth_camera_info is None else _Models(config, topics.depth_camera_info, drops)
 
     @property
     def oldest_ns(self) -> int | None:
@@ -141,7 +142,7 @@ class CameraPairer:
                 check_size(image_size(message, topic), model.intrinsics, topic, self._topics.camera_info)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
-            self._tally.drop(error)
+            self._drops.add_error(error)
             return
         self._rgb.append(stamped)
         self._follow_frame(topic, stamped.frame)
@@ -153,7 +154,7 @@ class CameraPairer:
             check_depth(message, topic)
             stamped = _Stamped(self._timeline.advance(topic, message), message)
         except FrameError as error:
-            self._tally.drop(error)
+            self._drops.add_error(error)
             return
         self._depth.append(stamped)
         self._follow_frame(topic, stamped.frame)
@@ -176,7 +177,7 @@ class CameraPairer:
             try:
                 paired = self._pair(head, FOREVER_NS if final else newest_ns - head.stamp_ns)
             except FrameError as error:
-                self._tally.drop(error)
+                self._drops.add_error(error)
             else:
                 if paired is None:
                     break
@@ -215,7 +216,7 @@ class CameraPairer:
         known = self._frames.get(topic, frame)
         self._frames[topic] = frame
         if frame != known:
-            self._tally.drop(FrameError(f"{topic}: frame_id changed from '{known}' to '{frame}'", reason="frame_id_changed"))
+            self._drops.add("frame_id_changed", f"{topic}: frame_id changed from '{known}' to '{frame}'")
 
     def _pair(self, rgb: _Stamped, waited_ns: int) -> PairedMessages | None:
         """Return the complete pair, or None while a part may still come; raise FrameError once a part cannot come."""

@@ -5,7 +5,6 @@ The same class serves the live node and recordings. It only reads headers; pixel
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
 from fus3dmaps_core.config.input import InputConfig
@@ -16,7 +15,7 @@ from fus3dmaps_core.sources.camera import CameraPairer
 from fus3dmaps_core.sources.paired import PairedMessages
 from fus3dmaps_core.sources.poses import BufferedPoses, Mounting, PoseProvider, TransformPoses
 from fus3dmaps_core.sources.streams import Stream, camera_topics, pose_parameter, pose_topic, pose_type, uses_tf
-from fus3dmaps_core.sources.timeline import Tally, Timeline
+from fus3dmaps_core.sources.timeline import Timeline
 from fus3dmaps_core.sources.transforms import TransformBuffer
 
 __all__ = ["FramePairer", "PairedMessages"]
@@ -31,6 +30,13 @@ class FramePairer:
     than three seconds (a looped recording, a restarted simulation), waiting images are paired or dropped and pairing goes
     on from the new time. A camera model is valid from its stamp until a different one comes. Several cameras share the poses
     and the clock; their frames come in the order of their stamps. Not thread-safe: callers hold a lock.
+
+    Attributes:
+        drops: Messages and colour images that led to no frame, by reason: ``unknown_encoding``, ``bad_image``,
+            ``size_mismatch``, ``bad_intrinsics``, ``bad_pose``, ``bad_transform``, ``wrong_frame``, ``stamp_backwards``,
+            ``stamp_repeated``, ``no_camera_info``, ``no_depth``, ``no_pose``, ``pose_gap``, ``tf_unknown_frame``,
+            ``tf_not_connected``; and once per change, without losing a frame: ``time_jump``, ``intrinsics_changed``,
+            ``frame_id_changed``.
     """
 
     def __init__(self, config: InputConfig, transforms: TransformBuffer | None = None) -> None:
@@ -47,8 +53,8 @@ class FramePairer:
             parameter = "pose_source" if config.pose_source == "tf" else "extrinsic_source"
             raise ConfigError(f"parameter 'input.{parameter}': there is no TF to look up in")
         self._config = config
-        self._tally = Tally()
-        self._timeline = Timeline(self._tally, lambda: self._settle(final=True), self._start_anew)
+        self.drops = Drops()
+        self._timeline = Timeline(self.drops, lambda: self._settle(final=True), self._start_anew)
         self._buffered = BufferedPoses(config)
         self._poses: PoseProvider = self._buffered
         if config.pose_source == "tf" and transforms is not None:
@@ -57,27 +63,11 @@ class FramePairer:
         topics = camera_topics(config)
         frames = [frame.strip() for frame in config.camera_frame.split(",")] if config.camera_frame else [""] * len(topics)
         self._cameras = [
-            CameraPairer(config, own, self._poses, Mounting(config, i, transforms), frames[i], self._timeline, self._tally)
+            CameraPairer(config, own, self._poses, Mounting(config, i, transforms), frames[i], self._timeline, self.drops)
             for i, own in enumerate(topics)
         ]
         self._held: list[PairedMessages] = []
         self._ready: list[PairedMessages] = []
-
-    @property
-    def drops(self) -> Counter[str]:
-        """Messages and colour images that led to no frame, by reason.
-
-        ``unknown_encoding``, ``bad_image``, ``size_mismatch``, ``bad_intrinsics``, ``bad_pose``, ``bad_transform``,
-        ``wrong_frame``, ``stamp_backwards``, ``stamp_repeated``, ``no_camera_info``, ``no_depth``, ``no_pose``,
-        ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected``; and once per change, without losing a frame:
-        ``time_jump``, ``intrinsics_changed``, ``frame_id_changed``.
-        """
-        return self._tally.drops.counts()
-
-    @property
-    def last_drop(self) -> dict[str, str]:
-        """Explanation of the latest drop of each reason; it names the topic."""
-        return self._tally.drops.latest()
 
     def streams(self) -> list[Stream]:
         """List every topic to listen to except TF: those of the cameras, then the poses."""
@@ -106,7 +96,7 @@ class FramePairer:
             T_world_body = to_pose(message, topic)
             stamp_ns = self._timeline.advance(topic, message)
         except FrameError as error:
-            self.drop(error)
+            self.drops.add_error(error)
             return
         self._buffered.child_frame = getattr(message, "child_frame_id", "")
         self._buffered.add(stamp_ns, T_world_body)
@@ -127,14 +117,6 @@ class FramePairer:
         self._ready.clear()
         self._held.clear()
         self._timeline.clear()
-
-    def drop(self, error: FrameError) -> None:
-        """Count a message that cannot be used."""
-        self._tally.drop(error)
-
-    def hand_over_drops(self, drops: Drops) -> None:
-        """Move the counts of :attr:`drops` to another count: each reason once, with its number and latest explanation."""
-        self._tally.drops.pour_into(drops)
 
     def _start_anew(self) -> None:
         for camera in self._cameras:

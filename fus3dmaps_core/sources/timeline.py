@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 from fus3dmaps_core.errors import FrameError
@@ -11,21 +10,6 @@ from fus3dmaps_core.ledger import Drops
 from fus3dmaps_core.messages import fields
 
 _TIME_JUMP_NS = 3_000_000_000  # Delivery can swap neighbours. Only another clock or a restart goes back this far.
-
-
-@dataclass
-class Tally:
-    """Counts of dropped messages.
-
-    Attributes:
-        drops: Messages that led to no frame, and events worth noting, by reason.
-    """
-
-    drops: Drops = field(default_factory=Drops)
-
-    def drop(self, error: FrameError) -> None:
-        """Count a message that cannot be used."""
-        self.drops.add(error.reason, str(error))
 
 
 class Timeline:
@@ -37,15 +21,15 @@ class Timeline:
         last_ns: Latest stamp of each topic since time (re)started.
     """
 
-    def __init__(self, tally: Tally, settle: Callable[[], None], forget: Callable[[], None]) -> None:
+    def __init__(self, drops: Drops, settle: Callable[[], None], forget: Callable[[], None]) -> None:
         """Start without a stamp.
 
         Args:
-            tally: Counts ``time_jump``.
+            drops: Counts ``time_jump``.
             settle: Called before time restarts, to pair or drop what waits.
             forget: Called after that, to remove what belongs to the old time.
         """
-        self._tally = tally
+        self._drops = drops
         self._settle = settle
         self._forget = forget
         self.last_ns: dict[str, int] = {}
@@ -75,9 +59,7 @@ class Timeline:
                 )
             self._settle()
             self.clear()
-            self._tally.drop(
-                FrameError(f"{topic}: time jumped back {back_s:.1f} s to {seconds(stamp_ns)}", reason="time_jump")
-            )
+            self._drops.add("time_jump", f"{topic}: time jumped back {back_s:.1f} s to {seconds(stamp_ns)}")
         self.last_ns[topic] = stamp_ns
         return stamp_ns
 

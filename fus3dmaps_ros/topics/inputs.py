@@ -121,6 +121,6 @@ class Inputs:
         with self._lock:
             ready = self._pairer.poll()
         # Together: many images that are given up at once are one line in the log.
-        self._pairer.hand_over_drops(self._drops)
+        self._pairer.drops.pour_into(self._drops)
         for paired in ready:
             self._take(paired)

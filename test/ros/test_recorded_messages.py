@@ -37,4 +37,4 @@ def test_recorded_messages_pass_through_ros_and_the_pairer(tmp_path):
                 assert message.distortion_model == "plumb_bob"
             add(message)
     assert_same_frames([paired.decode(ImageConfig()) for paired in pairer.poll()], frames)
-    assert not pairer.drops
+    assert not pairer.drops.counts()

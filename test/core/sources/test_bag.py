@@ -78,7 +78,7 @@ def test_frames_survive_the_round_trip(tmp_path, frames, config):
         assert len(source) == 5
         for _ in range(2):  # Each iteration starts anew.
             assert_same_frames([paired.decode(ImageConfig()) for paired in source], frames[:5])
-            assert not source.pairer.drops
+            assert not source.pairer.drops.counts()
 
 
 def test_frames_come_while_reading(recording, monkeypatch):
@@ -166,14 +166,14 @@ def test_bad_messages_are_dropped_and_counted_and_the_rest_is_delivered(tmp_path
     ]
     with BagSource(write_messages(tmp_path / "bag.mcap", messages), InputConfig()) as source:
         assert [paired.stamp_ns for paired in source] == [START_NS, second]
-        assert source.pairer.drops == {
+        assert source.pairer.drops.counts() == {
             "bad_message": 1,
             "unknown_encoding": 1,
             "size_mismatch": 1,
             "bad_pose": 1,
             "stamp_backwards": 1,
         }
-        assert "/rgb/image" in source.pairer.last_drop["bad_message"]
+        assert "/rgb/image" in source.pairer.drops.latest()["bad_message"]
 
 
 def test_images_at_the_end_are_settled(tmp_path):
@@ -186,7 +186,7 @@ def test_images_at_the_end_are_settled(tmp_path):
     ]
     with BagSource(write_messages(tmp_path / "bag.mcap", messages), InputConfig()) as source:
         assert [paired.stamp_ns for paired in source] == [START_NS, START_NS + PERIOD_NS]
-        assert source.pairer.drops == {"no_depth": 1}
+        assert source.pairer.drops.counts() == {"no_depth": 1}
 
 
 def test_compressed_recordings(tmp_path, frames):
@@ -221,7 +221,7 @@ def test_poses_from_the_transforms_of_a_recording(tmp_path):
     with BagSource(path, InputConfig(pose_source="tf")) as source:
         for _ in range(2):  # Each iteration starts anew.
             assert [paired.T_world_camera[:2, 3].tolist() for paired in source] == [[1.0, 3.0], [2.0, 3.0]]
-            assert source.pairer.drops == {"bad_transform": 1}
+            assert source.pairer.drops.counts() == {"bad_transform": 1}
 
 
 def test_a_recording_without_transforms_is_refused(recording):

@@ -43,7 +43,7 @@ def test_a_complete_frame_is_ready_at_once_and_once():
     assert paired.T_world_camera[0, 3] == 100.0
     assert paired.intrinsics.fx == 5.0
     assert target.poll() == []
-    assert not target.drops
+    assert not target.drops.counts()
 
 
 def test_pixels_are_decoded_on_demand():
@@ -101,7 +101,7 @@ def test_depth_within_the_tolerance_only(offset_ns, pairs):
     target.add_depth(ros.image(START + offset_ns, "16UC1"))
     target.add_rgb(ros.image(START))
     assert len(target.flush()) == pairs
-    assert target.drops["no_depth"] == 1 - pairs
+    assert target.drops.counts()["no_depth"] == 1 - pairs
 
 
 def test_depth_that_cannot_come_any_more_is_not_waited_for():
@@ -109,10 +109,10 @@ def test_depth_that_cannot_come_any_more_is_not_waited_for():
     target.add_rgb(ros.image(START))
     target.add_depth(ros.image(START + 40 * MS, "16UC1"))
     assert target.poll() == []
-    assert target.drops == {"no_depth": 1}
-    assert "rgb/image" in target.last_drop["no_depth"]
-    assert "depth/image" in target.last_drop["no_depth"]
-    assert "0.040 s" in target.last_drop["no_depth"]
+    assert target.drops.counts() == {"no_depth": 1}
+    assert "rgb/image" in target.drops.latest()["no_depth"]
+    assert "depth/image" in target.drops.latest()["no_depth"]
+    assert "0.040 s" in target.drops.latest()["no_depth"]
 
 
 def test_images_from_before_the_first_pose_are_dropped():
@@ -121,7 +121,7 @@ def test_images_from_before_the_first_pose_are_dropped():
     target.add_rgb(ros.image(START))
     target.add_pose(ros.pose(START + MS))
     assert target.poll() == []
-    assert target.drops == {"no_pose": 1}
+    assert target.drops.counts() == {"no_pose": 1}
     feed(target, START + 2 * MS)
     assert stamps(target.poll()) == [START + 2 * MS]
 
@@ -133,8 +133,8 @@ def test_images_in_a_gap_of_the_trajectory_are_dropped():
     target.add_rgb(ros.image(START + 300 * MS))
     target.add_pose(ros.pose(START + 501 * MS))
     assert target.poll() == []
-    assert target.drops == {"pose_gap": 1}
-    assert "pose" in target.last_drop["pose_gap"]
+    assert target.drops.counts() == {"pose_gap": 1}
+    assert "pose" in target.drops.latest()["pose_gap"]
 
 
 @pytest.mark.parametrize(("missing", "reason"), [("pose", "no_pose"), ("depth", "no_depth"), ("info", "no_camera_info")])
@@ -152,9 +152,9 @@ def test_waiting_ends_by_the_stamps_of_the_messages(missing, reason):
         target.add_rgb(ros.image(stamp_ns))
         ready += target.poll()
     assert ready == []
-    assert target.drops == {reason: 80}
+    assert target.drops.counts() == {reason: 80}
     assert target.flush() == []
-    assert target.drops == {reason: 101}
+    assert target.drops.counts() == {reason: 101}
 
 
 def test_a_camera_model_that_comes_late_serves_the_waiting_images():
@@ -184,21 +184,21 @@ def test_a_camera_model_that_comes_late_serves_the_waiting_images():
 def test_bad_messages_are_counted_and_named_and_pairing_goes_on(add, reason, topic):
     target = pairer()
     add(target)
-    assert target.drops == {reason: 1}
-    assert topic in target.last_drop[reason]
+    assert target.drops.counts() == {reason: 1}
+    assert topic in target.drops.latest()[reason]
     feed(target, START)
     assert stamps(target.poll()) == [START]
-    assert target.drops == {reason: 1}
+    assert target.drops.counts() == {reason: 1}
 
 
 def test_wrong_frame_names_both_frames():
     target = pairer()
     target.add_pose(ros.pose(START, frame_id="odom"))
-    assert "'odom'" in target.last_drop["wrong_frame"]
-    assert "'map'" in target.last_drop["wrong_frame"]
+    assert "'odom'" in target.drops.latest()["wrong_frame"]
+    assert "'map'" in target.drops.latest()["wrong_frame"]
     target = pairer(map_frame="odom")
     target.add_pose(ros.pose(START, frame_id="/odom"))
-    assert not target.drops
+    assert not target.drops.counts()
 
 
 def test_depth_of_another_resolution_but_not_of_another_shape():
@@ -208,8 +208,8 @@ def test_depth_of_another_resolution_but_not_of_another_shape():
         target.add_depth(ros.image(stamp_ns, "16UC1", np.zeros(shape, np.uint16)))
         target.add_rgb(ros.image(stamp_ns))
     assert stamps(target.poll()) == [START, START + 2 * MS]
-    assert target.drops == {"size_mismatch": 1}
-    assert "4x4" in target.last_drop["size_mismatch"]
+    assert target.drops.counts() == {"size_mismatch": 1}
+    assert "4x4" in target.drops.latest()["size_mismatch"]
 
 
 def test_a_camera_model_of_another_size_is_noticed_at_pairing():
@@ -217,7 +217,7 @@ def test_a_camera_model_of_another_size_is_noticed_at_pairing():
     feed(target, START)
     target.add_camera_info(ros.camera_info(width=12, height=8))
     assert target.poll() == []
-    assert target.drops == {"size_mismatch": 1}
+    assert target.drops.counts() == {"size_mismatch": 1}
 
 
 def test_stamps_that_run_backwards_are_dropped_and_counted():
@@ -227,8 +227,8 @@ def test_stamps_that_run_backwards_are_dropped_and_counted():
     feed(target, START)
     feed(target, START + 100 * MS)
     assert stamps(target.poll()) == [START, START + 100 * MS]
-    assert target.drops == {"stamp_backwards": 3, "stamp_repeated": 3}
-    assert "0.500 s" in target.last_drop["stamp_backwards"]
+    assert target.drops.counts() == {"stamp_backwards": 3, "stamp_repeated": 3}
+    assert "0.500 s" in target.drops.latest()["stamp_backwards"]
 
 
 def test_a_looped_recording_starts_over():
@@ -240,8 +240,8 @@ def test_a_looped_recording_starts_over():
             ready += target.poll()
     assert len(ready) == 300
     # In each loop the pose comes first; it clears the clocks of the others, so that a jump counts once.
-    assert target.drops == {"time_jump": 2}
-    assert "9.9 s" in target.last_drop["time_jump"]
+    assert target.drops.counts() == {"time_jump": 2}
+    assert "9.9 s" in target.drops.latest()["time_jump"]
 
 
 def test_a_time_jump_settles_what_was_waiting():
@@ -251,7 +251,7 @@ def test_a_time_jump_settles_what_was_waiting():
     target.add_rgb(ros.image(START + 50 * MS))
     feed(target, START - 60 * S)
     assert stamps(target.poll()) == [START - 60 * S]
-    assert target.drops == {"time_jump": 1, "no_pose": 1}
+    assert target.drops.counts() == {"time_jump": 1, "no_pose": 1}
 
 
 def test_reset_forgets_time_but_not_the_counts():
@@ -263,7 +263,7 @@ def test_reset_forgets_time_but_not_the_counts():
     assert target.flush() == []
     feed(target, START - S)
     assert stamps(target.poll()) == [START - S]
-    assert target.drops == {"stamp_backwards": 1}
+    assert target.drops.counts() == {"stamp_backwards": 1}
 
 
 @pytest.mark.parametrize("alive", ["rgb", "depth", "pose"])
@@ -338,7 +338,7 @@ def test_random_streams_agree_with_brute_force(rgb, depth, poses, delays_ms, tol
         depth_ns, x_m = expected[paired.stamp_ns]
         assert ros_stamp(paired.depth) == depth_ns
         assert paired.T_world_camera[0, 3] == pytest.approx(x_m, abs=1e-9)
-    assert len(ready) + sum(target.drops.values()) == len(rgb)
+    assert len(ready) + sum(target.drops.counts().values()) == len(rgb)
 
 
 def ros_stamp(message) -> int:

@@ -57,7 +57,7 @@ def test_the_camera_is_looked_up_under_the_name_in_its_images():
     setup.is_fixed("base", "camera", (0.0, 0.0, 1.0), (0.0, 0.0, HALF, HALF))
     expected = [[0, -1, 0, 1], [1, 0, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
     np.testing.assert_allclose(setup.poses()[0], expected, atol=1e-12)
-    assert not setup.pairer.drops
+    assert not setup.pairer.drops.counts()
 
 
 def test_the_camera_may_be_named_and_the_body_mounted_by_parameter():
@@ -98,12 +98,12 @@ def test_what_does_not_come_is_given_up_by_name(reason, named, edges):
     setup.sees(START)
     setup.sees(START + 500 * MS)
     assert setup.poses() == []
-    assert not setup.pairer.drops
+    assert not setup.pairer.drops.counts()
     setup.sees(START + 501 * MS)
     assert setup.poses() == []
-    assert setup.pairer.drops == {reason: 1}
-    assert "rgb/image" in setup.pairer.last_drop[reason]
-    assert named in setup.pairer.last_drop[reason]
+    assert setup.pairer.drops.counts() == {reason: 1}
+    assert "rgb/image" in setup.pairer.drops.latest()[reason]
+    assert named in setup.pairer.drops.latest()[reason]
 
 
 @pytest.mark.parametrize(
@@ -115,7 +115,7 @@ def test_what_cannot_come_is_given_up_at_once(reason, offsets_ms):
         setup.moves("map", "camera", START + offset_ms * MS, 0.0)
     setup.sees(START)
     assert setup.poses() == []
-    assert setup.pairer.drops == {reason: 1}
+    assert setup.pairer.drops.counts() == {reason: 1}
 
 
 def test_an_image_without_a_frame_says_what_to_set():
@@ -125,7 +125,7 @@ def test_an_image_without_a_frame_says_what_to_set():
     setup.pairer.add_depth(ros.image(START, "16UC1"))
     setup.pairer.add_rgb(nameless)
     assert setup.poses() == []
-    assert "input.camera_frame" in setup.pairer.last_drop["tf_unknown_frame"]
+    assert "input.camera_frame" in setup.pairer.drops.latest()["tf_unknown_frame"]
 
 
 def test_a_restart_forgets_what_moved():
