@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 _MULTIPLIER = np.int64(-7046029254386353131)  # 2^64 / golden ratio, as in the hash.

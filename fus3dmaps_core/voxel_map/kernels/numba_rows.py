@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.numba_values import put_at, value_at
 from fus3dmaps_core.voxel_map.rows.rounding import FRESH_SCALE_STEPS, KEEP_SCALE_ABOVE, KEEP_SCALE_BELOW, TINY
 

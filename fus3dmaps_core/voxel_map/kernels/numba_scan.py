@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.keys import BITS, HALF
 from fus3dmaps_core.voxel_map.kernels.numba_cosines import cosines, fused_cosines
 from fus3dmaps_core.voxel_map.kernels.protocols import SCORE_UNIT
