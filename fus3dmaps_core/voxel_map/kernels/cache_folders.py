@@ -11,6 +11,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from uuid import uuid4
 
 _PREFIX = "loops-"
 _KEPT = 4  # Folders of earlier contents that stay: another version may be in use beside this one.
@@ -70,7 +71,7 @@ def write(path: Path, content: bytes) -> None:
     Raises:
         OSError: It cannot be written.
     """
-    unfinished = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    unfinished = path.with_name(f"{path.name}.{uuid4().hex}.tmp")
     try:
         unfinished.write_bytes(content)
         unfinished.replace(path)

@@ -1,7 +1,4 @@
-"""Compiled loops over proposals and hypotheses: association, counting, displacement and merging.
-
-Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
-"""
+"""Compiled loops over proposals and hypotheses: association, counting, displacement and merging."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Compiled loops over points and keys: voxelising, grouping, and the probing of the voxel hash.
-
-Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
-"""
+"""Compiled loops over points and keys: voxelising, grouping, and the probing of the voxel hash."""
 
 from __future__ import annotations
 

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 pytest.importorskip("numba")
 
 import fus3dmaps_core
-from fus3dmaps_core.voxel_map.kernels import cache_folders
+from fus3dmaps_core.voxel_map.kernels import cache_folders, compile_cache
 from fus3dmaps_core.voxel_map.kernels.loop_sources import source_files
 
 KERNELS = "fus3dmaps_core.voxel_map.kernels"
@@ -109,7 +110,7 @@ def outcome(process: subprocess.Popen[str]) -> tuple[int, bool, list[str]]:
 
 def files_under(folder: Path) -> list[Path]:
     """Files of machine code under a folder."""
-    return sorted(folder.glob("loops-*/numba_probe.*"))
+    return sorted(folder.glob("loops-*/*.bin"))
 
 
 @pytest.fixture
@@ -132,13 +133,6 @@ def copy(tmp_path) -> Copy:
     return made
 
 
-@pytest.fixture
-def blocked(copy) -> Copy:
-    """A copy that has no room beside its source, not even for root."""
-    copy.beside.write_text("in the way")
-    return copy
-
-
 def test_the_sources_of_the_real_loops_are_found_through_their_imports():
     names = {f"{path.parent.name}/{path.name}" for path in source_files()}
     loops = {f"kernels/{path.name}" for path in Path(cache_folders.__file__).parent.glob("numba_*.py")}
@@ -147,103 +141,173 @@ def test_the_sources_of_the_real_loops_are_found_through_their_imports():
     assert "voxel_map/semantic_map.py" not in names
 
 
-def test_a_second_process_takes_the_loop_from_the_cache_beside_the_source(copy):
+def test_a_change_in_any_file_that_a_loop_is_made_of_is_never_answered_from_the_cache(copy, tmp_path):
     assert copy.run() == (1101, False, [])
-    assert copy.run() == (1101, True, [])
-    assert len(files_under(copy.beside)) == 1
-    assert not any((copy.folder.parent / "home").iterdir())
-
-
-@pytest.mark.parametrize(
-    ("path", "old", "new", "value"),
-    [
-        ("voxel_map/kernels/probe_parts.py", "value + CONSTANT", "value + 2 * CONSTANT", 1102),
-        ("voxel_map/kernels/probe_parts.py", "return 100", "return 200", 1201),
-        ("voxel_map/kernels/probe_parts.py", "MADE = 1000", "MADE = 2000", 2101),
-        ("voxel_map/rows/probe_constants.py", "CONSTANT = 1", "CONSTANT = 5", 1105),
-    ],
-    ids=["a called loop", "an inlined function", "an intrinsic", "a constant"],
-)
-def test_a_change_in_another_file_is_never_answered_from_the_cache(copy, path, old, new, value):
-    copy.run()
-    copy.edit(path, old, new)
-    assert copy.run() == (value, False, [])
-    copy.edit(path, new, old)
-    assert copy.run() == (1101, True, [])
-
-
-def test_what_loops_are_not_made_of_leaves_the_cache_as_it_is(copy):
-    copy.run()
+    copy.edit("voxel_map/kernels/probe_parts.py", "value + CONSTANT", "value + 2 * CONSTANT")  # A loop that it calls.
+    assert copy.run() == (1102, False, [])
+    copy.edit("voxel_map/kernels/probe_parts.py", "return 100", "return 200")  # A function that is inlined.
+    assert copy.run() == (1202, False, [])
+    copy.edit("voxel_map/kernels/probe_parts.py", "MADE = 1000", "MADE = 2000")  # An intrinsic.
+    assert copy.run() == (2202, False, [])
+    copy.edit("voxel_map/rows/probe_constants.py", "CONSTANT = 1", "CONSTANT = 5")
+    assert copy.run() == (2210, False, [])
+    # What it is not made of changes nothing, nor do dates.
     copy.edit("voxel_map/semantic_map.py", "from __future__", "# changed\nfrom __future__")
     os.utime(copy.kernels / "numba_probe.py", (1, 1))
-    assert copy.run() == (1101, True, [])
+    assert copy.run() == (2210, True, [])
+    copy.edit("voxel_map/rows/probe_constants.py", "CONSTANT = 5", "CONSTANT = 1")
+    assert copy.run() == (2202, True, [])
+    assert len(files_under(copy.beside)) == 2 * 5
+    assert not any((tmp_path / "home").iterdir())
 
 
-def test_where_the_source_is_read_only_the_users_cache_is_taken(blocked, tmp_path):
-    assert blocked.run() == (1101, False, [])
-    assert blocked.run() == (1101, True, [])
-    assert len(files_under(tmp_path / "home" / ".cache" / "fus3dmaps")) == 1
-    blocked.environment["XDG_CACHE_HOME"] = str(tmp_path / "settings" / "cache")
-    assert blocked.run() == (1101, False, [])
-    assert len(files_under(tmp_path / "settings" / "cache" / "fus3dmaps")) == 1
-
-
-def test_a_read_only_home_leaves_a_private_folder_for_temporary_files(blocked, tmp_path):
-    for home in (tmp_path / "nowhere", blocked.beside, blocked.beside / "below a file"):
-        blocked.environment["HOME"] = str(home)
-        blocked.run()
-        assert blocked.run() == (1101, True, [])
-    assert not (tmp_path / "nowhere").exists()
-    (folder,) = (tmp_path / "temporary").iterdir()
-    assert folder.stat().st_mode & 0o777 == 0o700
-    assert len(files_under(folder)) == 1
-
-
-def test_without_any_folder_the_loop_is_compiled_and_one_warning_says_what_to_set(blocked, tmp_path):
-    blocked.environment["HOME"] = str(blocked.beside)
-    (tmp_path / "temporary" / f"fus3dmaps-{os.getuid()}").write_text("in the way")
-    value, cached, log = blocked.run()
+def test_without_any_folder_the_loop_is_compiled_and_one_warning_says_what_to_set(copy, tmp_path):
+    for path in (copy.beside, tmp_path / "temporary" / f"fus3dmaps-{os.getuid()}"):
+        path.write_text("in the way")  # Stops root too, whom no permission stops.
+    copy.environment["HOME"] = str(copy.beside)
+    value, cached, log = copy.run()
     assert (value, cached) == (1101, False)
     (line,) = log
     assert line.startswith("WARNING")
     assert "NUMBA_CACHE_DIR" in line
 
 
-def test_the_folder_that_the_user_names_comes_first(copy, tmp_path):
-    copy.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "named")
-    assert copy.run() == (1101, False, [])
+def test_processes_that_start_together_do_not_disturb_one_another(copy):
+    assert {outcome(process)[0] for process in [copy.start() for _ in range(3)]} == {1101}
+    assert not list(copy.beside.glob("*/*.tmp"))
     assert copy.run() == (1101, True, [])
-    assert len(files_under(tmp_path / "named" / "fus3dmaps")) == 1
-    assert files_under(copy.beside) == []
 
 
-def test_nothing_is_loaded_from_a_folder_that_others_can_write_to(blocked, tmp_path):
-    blocked.environment["NUMBA_CACHE_DIR"] = str(tmp_path / "named")
-    blocked.run()
-    (file,) = files_under(tmp_path / "named" / "fus3dmaps")
+@dataclass
+class Places:
+    """Every folder that this process may use, all below one."""
+
+    folder: Path
+
+    @property
+    def beside(self) -> Path:
+        return self.folder / "kernels" / "__pycache__"
+
+    @property
+    def home(self) -> Path:
+        return self.folder / "home"
+
+    @property
+    def temporary(self) -> Path:
+        return self.folder / "temporary" / f"fus3dmaps-{os.getuid()}"
+
+    def is_cached(self) -> bool:
+        """Call a loop as at the start of a process, and tell whether it came from the cache."""
+        compile_cache._folders.cache_clear()
+        loop = compile_cache.njit(cache=True)(add_one)
+        assert loop(1) == 2
+        return sum(loop.stats.cache_hits.values()) == 1
+
+    def used(self) -> list[Path]:
+        """The folders that hold machine code."""
+        return sorted(file.parent.parent for file in self.folder.rglob("*.bin"))
+
+
+def add_one(value):
+    return value + 1
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch) -> Iterator[Places]:
+    made = Places(tmp_path)
+    for name in ("kernels", "home", "temporary"):
+        (tmp_path / name).mkdir(mode=0o700)
+    (tmp_path / "kernels" / "cache_folders.py").touch()
+    monkeypatch.setattr(cache_folders, "__file__", str(tmp_path / "kernels" / "cache_folders.py"))
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr("numba.config.CACHE_DIR", "")
+    monkeypatch.setenv("HOME", str(made.home))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    yield made
+    compile_cache._folders.cache_clear()
+    compile_cache._warn_once.cache_clear()
+
+
+@pytest.fixture
+def blocked(places) -> Places:
+    """Without room beside the source, not even for root."""
+    places.beside.write_text("in the way")
+    return places
+
+
+def test_machine_code_is_kept_beside_the_source(places):
+    assert [places.is_cached(), places.is_cached()] == [False, True]
+    assert places.used() == [places.beside]
+
+
+def test_where_the_source_is_read_only_the_users_cache_is_taken(blocked, monkeypatch, tmp_path):
+    assert [blocked.is_cached(), blocked.is_cached()] == [False, True]
+    assert blocked.used() == [blocked.home / ".cache" / "fus3dmaps"]
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "settings" / "cache"))
+    assert [blocked.is_cached(), blocked.is_cached()] == [False, True]
+    assert tmp_path / "settings" / "cache" / "fus3dmaps" in blocked.used()
+
+
+@pytest.mark.parametrize("home", ["nowhere", "a file", "a file/below"])
+def test_without_a_home_to_write_to_a_private_folder_for_temporary_files_is_taken(blocked, monkeypatch, home):
+    (blocked.folder / "a file").touch()
+    monkeypatch.setenv("HOME", str(blocked.folder / home))
+    assert [blocked.is_cached(), blocked.is_cached()] == [False, True]
+    assert blocked.used() == [blocked.temporary]
+    assert blocked.temporary.stat().st_mode & 0o777 == 0o700
+    assert not (blocked.folder / "nowhere").exists()
+
+
+def test_a_user_without_home_or_temporary_files_is_warned_once(blocked, monkeypatch, caplog):
+    def missing(*_: object) -> None:
+        raise RuntimeError
+
+    monkeypatch.setattr(Path, "home", missing)
+    blocked.temporary.touch()
+    assert [blocked.is_cached(), blocked.is_cached()] == [False, False]
+    (record,) = caplog.records
+    assert "NUMBA_CACHE_DIR" in record.getMessage()
+
+
+def test_the_folder_that_the_user_names_comes_first(places, monkeypatch, tmp_path):
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "named"))
+    assert [places.is_cached(), places.is_cached()] == [False, True]
+    assert places.used() == [tmp_path / "named" / "fus3dmaps"]
+
+
+def test_what_somebody_else_filled_is_used_where_nothing_can_be_written(places, monkeypatch, caplog):
+    assert not places.is_cached()
+
+    def refuse(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(cache_folders, "make", refuse)
+    assert places.is_cached()
+    assert not caplog.records
+
+
+def test_nothing_is_loaded_from_a_folder_that_others_can_write_to(places):
+    places.is_cached()
+    (file,) = files_under(places.beside)
     file.parent.chmod(0o777)
-    assert blocked.run() == (1101, False, [])
-    assert blocked.run() == (1101, True, [])  # From the user's own cache.
-    assert len(files_under(tmp_path / "home" / ".cache" / "fus3dmaps")) == 1
+    assert [places.is_cached(), places.is_cached()] == [False, True]
+    assert places.used() == [places.home / ".cache" / "fus3dmaps", places.beside]
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
-def test_nothing_is_loaded_from_a_folder_of_another_user(blocked, tmp_path):
-    blocked.environment["HOME"] = str(tmp_path / "nowhere")
-    blocked.run()
-    (file,) = files_under(tmp_path / "temporary" / f"fus3dmaps-{os.getuid()}")
-    os.chown(file.parent, 65534, 65534)
-    assert not cache_folders.is_safe(file.parent)
-    value, cached, log = blocked.run()
-    assert (value, cached, len(log)) == (1101, False, 1)
-    os.chown(file.parent, 0, 0)
-    os.chown(file.parent.parent, 65534, 65534)
-    assert not cache_folders.is_safe(file.parent)
+@pytest.mark.parametrize("given", ["the folder", "the one above"])
+def test_nothing_is_loaded_from_a_folder_of_another_user(blocked, monkeypatch, given):
+    monkeypatch.setenv("HOME", str(blocked.folder / "nowhere"))
+    blocked.is_cached()
+    (folder,) = blocked.temporary.iterdir()
+    os.chown(folder if given == "the folder" else blocked.temporary, 65534, 65534)
+    assert [blocked.is_cached(), blocked.is_cached()] == [False, False]
 
 
 def test_a_folder_below_one_that_others_can_change_is_not_safe(tmp_path):
     folder = tmp_path / "open" / "inner" / "loops-0"
-    folder.mkdir(parents=True, mode=0o755)
+    folder.mkdir(parents=True)
+    folder.chmod(0o755)
     assert cache_folders.is_safe(folder)
     (tmp_path / "open").chmod(0o777)
     assert not cache_folders.is_safe(folder)
@@ -254,31 +318,23 @@ def test_a_folder_below_one_that_others_can_change_is_not_safe(tmp_path):
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "zeros"])
-def test_a_damaged_file_is_compiled_anew_and_replaced(copy, damage):
-    copy.run()
-    (file,) = files_under(copy.beside)
+def test_a_damaged_file_is_compiled_anew_and_replaced(places, damage):
+    places.is_cached()
+    (file,) = files_under(places.beside)
     content = file.read_bytes()
     half = len(content) // 2
     flipped = content[:half] + bytes([content[half] ^ 1]) + content[half + 1 :]
     file.write_bytes({"empty": b"", "cut": content[:half], "flipped": flipped, "zeros": bytes(len(content))}[damage])
-    assert copy.run() == (1101, False, [])
-    assert copy.run() == (1101, True, [])
+    assert [places.is_cached(), places.is_cached()] == [False, True]
 
 
-def test_a_file_that_cannot_be_read_or_replaced_is_kept_elsewhere(copy, tmp_path):
-    copy.run()
-    (file,) = files_under(copy.beside)
+def test_a_file_that_cannot_be_read_or_replaced_is_kept_elsewhere(places):
+    places.is_cached()
+    (file,) = files_under(places.beside)
     file.unlink()
     file.mkdir()
-    assert copy.run() == (1101, False, [])
-    assert copy.run() == (1101, True, [])
-    assert len(files_under(tmp_path / "home" / ".cache" / "fus3dmaps")) == 1
-
-
-def test_processes_that_start_together_do_not_disturb_one_another(copy):
-    assert {outcome(process)[0] for process in [copy.start() for _ in range(3)]} == {1101}
-    assert not list(copy.beside.glob("*/*.tmp"))
-    assert copy.run() == (1101, True, [])
+    assert [places.is_cached(), places.is_cached()] == [False, True]
+    assert len(files_under(places.home / ".cache" / "fus3dmaps")) == 1
 
 
 def test_few_folders_of_earlier_contents_stay(tmp_path):
