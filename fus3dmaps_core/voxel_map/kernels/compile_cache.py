@@ -99,6 +99,6 @@ def _folders() -> tuple[Any, ...]:
 @cache
 def _warn_once() -> None:
     _LOG.warning(
-        "no folder was found for compiled loops, so every start takes some twelve seconds longer; set NUMBA_CACHE_DIR to a"
+        "no folder was found for compiled loops, so every start takes some fifteen seconds longer; set NUMBA_CACHE_DIR to a"
         " folder that you, and nobody else, can write to"
     )

@@ -1,7 +1,7 @@
 """Compiled loops over embedding rows: reading and writing every storage type, and running means.
 
-Rows live in blocks whose addresses are handed over, so that a row is found without searching and a pool can grow without
-moving. Everything is computed in float32.
+Rows lie in blocks, and a loop gets the addresses of the blocks. So it finds a row without searching, and a pool can grow
+without moving. Everything is computed in float32.
 """
 
 from __future__ import annotations

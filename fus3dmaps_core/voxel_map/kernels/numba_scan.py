@@ -1,9 +1,9 @@
 """The compiled pass over voxels: what instances occupy, and how the voxels of a layer compare with texts.
 
-Every voxel is looked at once, a few thousand at a time, so that all that is known of them stays in the processor's cache
-between one loop and the next. Sums over an instance's voxels are kept in registers while neighbours have the same top
-hypothesis, then in a table of the few instances of these voxels. Loops index by unsigned numbers and name the axes one by
-one, which made them three times as fast.
+Every voxel is visited once, a few thousand at a time. So their data stays in the processor's cache between one loop and
+the next. Sums over an instance's voxels stay in registers while neighbours have the same top hypothesis, and then go into a
+table of the few instances of these voxels. Loops index by unsigned numbers and write out the three axes, which made them
+three times as fast.
 """
 
 from __future__ import annotations
