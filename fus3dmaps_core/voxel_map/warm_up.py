@@ -32,5 +32,8 @@ def warm_up(dimension: int, config: MapConfig) -> None:
             for prompts in (embeddings, embeddings[:1]):
                 rehearsal.search(layer, prompts, embeddings)
         rehearsal.fuse()
+        rehearsal.voxels()
+        rehearsal.instances()
+        rehearsal.import_state(rehearsal.export_state())
         rehearsal.prune_window(points_m[0])
         rehearsal.remove_voxels(points_m)

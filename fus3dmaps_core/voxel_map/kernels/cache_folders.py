@@ -54,7 +54,7 @@ def make(folder: Path) -> None:
     """Make a folder where it does not exist, and remove the oldest ones of other contents beside it.
 
     Raises:
-        OSError: It cannot be made, or another user could write to it.
+        OSError: It cannot be made, or other users could write to it.
     """
     if not folder.is_dir():
         root = folder.parent
@@ -73,7 +73,9 @@ def write(path: Path, content: bytes) -> None:
     """
     unfinished = path.with_name(f"{path.name}.{uuid4().hex}.tmp")
     try:
-        unfinished.write_bytes(content)
+        # Whatever the user's umask is, nobody else may write to it.
+        with os.fdopen(os.open(unfinished, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as stream:
+            stream.write(content)
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)

@@ -62,8 +62,12 @@ class LoopCache(NullCache):  # type: ignore[misc]
                 continue
             checksum, code = content[:_CHECKSUM_BYTES], content[_CHECKSUM_BYTES:]
             # Without the checksum, a file that lost bytes when the power went could end the process.
-            if hashlib.sha256(code).digest() == checksum:
+            if hashlib.sha256(code).digest() != checksum:
+                continue
+            try:
                 return CompileResult._rebuild(target, *pickle.loads(code))
+            except Exception as error:  # Whatever it is, a map that starts slowly is better than none.
+                _LOG.warning("compiled loop '%s' cannot be loaded (%s) and is compiled anew", folder / name, error)
         return None
 
     def save_overload(self, signature: Any, result: Any) -> None:

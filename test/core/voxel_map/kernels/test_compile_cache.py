@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -326,6 +328,27 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(places, damage):
     flipped = content[:half] + bytes([content[half] ^ 1]) + content[half + 1 :]
     file.write_bytes({"empty": b"", "cut": content[:half], "flipped": flipped, "zeros": bytes(len(content))}[damage])
     assert [places.is_cached(), places.is_cached()] == [False, True]
+
+
+def test_code_that_numba_refuses_is_compiled_anew_with_a_warning(places, caplog):
+    places.is_cached()
+    (file,) = files_under(places.beside)
+    code = pickle.dumps(("not", "what", "numba", "wrote"))
+    file.write_bytes(hashlib.sha256(code).digest() + code)
+    assert [places.is_cached(), places.is_cached()] == [False, True]
+    (record,) = caplog.records
+    assert str(file) in record.getMessage()
+
+
+def test_nobody_else_can_write_to_machine_code_whatever_the_umask(places):
+    before = os.umask(0)
+    try:
+        places.is_cached()
+    finally:
+        os.umask(before)
+    (file,) = files_under(places.beside)
+    assert file.stat().st_mode & 0o777 == 0o644
+    assert file.parent.stat().st_mode & 0o777 == 0o755
 
 
 def test_a_file_that_cannot_be_read_or_replaced_is_kept_elsewhere(places):
