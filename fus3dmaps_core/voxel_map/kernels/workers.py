@@ -1,8 +1,8 @@
 """Threads for compiled loops.
 
-On a machine whose cores are busy a thread may have to wait for a core longer than the whole work takes. So work is cut into
-a few parts for each thread, which whoever is free takes next, and the caller waits only for parts that somebody has begun.
-There are few parts, for between two of them a thread has to wait its turn in the interpreter.
+On a machine whose cores are busy, a thread may wait for a core longer than the whole work takes. So work is cut into a few
+parts for each thread. Whoever is free takes the next part, and the caller waits only for parts that somebody has begun.
+There are few parts, because between two of them a thread has to wait for its turn in the interpreter.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ _STEPS_PER_LANE = 6
 
 
 class Workers:
-    """The calling thread and helpers, together as many as torch uses."""
+    """The calling thread and its helpers, together as many threads as torch uses."""
 
     def __init__(self) -> None:
-        """Starts no thread yet."""
+        """Start no thread yet."""
         self._executor: ThreadPoolExecutor | None = None
 
     def run(self, tasks: list[Callable[[], Any]]) -> list[Any]:
-        """Run independent tasks on this thread and helpers; returns what they return, in order."""
+        """Run independent tasks on this thread and the helpers; returns their results in order."""
         results: list[Any] = [None] * len(tasks)
         waiting = iter(range(len(tasks)))  # Taking the next number is atomic.
 
@@ -53,13 +53,13 @@ def cuts(count: int, least: int) -> list[tuple[int, int]]:
 
 
 class Lanes:
-    """Steps of lanes, each of which one thread at a time goes through in order.
+    """Work that is dealt out to a fixed number of lanes; one thread at a time goes on with a lane, in order.
 
-    A sum that every lane has of its own does then not depend on the number of threads, nor on which of them was late.
+    Where every lane has a sum of its own, sums depend neither on the number of threads nor on which thread was late.
     """
 
     def __init__(self, count: int, lanes: int) -> None:
-        """Lane i has every ``lanes``-th of ``count`` things from the i-th on."""
+        """Give lane i every ``lanes``-th of ``count`` things, from the i-th on."""
         self._count, self._lanes = count, lanes
         self._span = lanes * max(1, -(-count // (lanes * _STEPS_PER_LANE)))
         self._next = list(range(lanes))
@@ -67,7 +67,7 @@ class Lanes:
         self._lock = threading.Lock()
 
     def __iter__(self) -> Iterator[tuple[int, int, int]]:
-        """Lane, first thing, and one more than the last, of the lane that has got least far; until no lane is free."""
+        """Yield the free lane that is furthest behind, its first thing and the step's end, until no lane is free."""
         while True:
             with self._lock:
                 lane = min(self._free, key=lambda lane: (self._next[lane], lane), default=None)
