@@ -50,7 +50,7 @@ class Intrinsics:
         return Intrinsics(self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5, width, height)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class PosedFrame:
     """One RGB-D image with the pose of its camera.
 
@@ -89,6 +89,13 @@ class PosedFrame:
                 reason="size_mismatch",
             )
         check_pose(self.T_world_camera)
+
+    def __repr__(self) -> str:
+        """Say when and where the frame was taken, and how large its images are."""
+        (height, width), (depth_height, depth_width) = self.rgb.shape[:2], self.depth_m.shape
+        x, y, z = self.T_world_camera[:3, 3]
+        images = f"colour {width}x{height}, depth {depth_width}x{depth_height}"
+        return f"PosedFrame({self.stamp_ns} ns, {images}, camera at ({x:.2f}, {y:.2f}, {z:.2f}) m)"
 
 
 def check_pose(T: NDArray[np.float64]) -> None:

@@ -128,6 +128,10 @@ class Ledger:
         self._stages_s: dict[str, float] = {}
         self._latest_s: deque[Mapping[str, float]] = deque(maxlen=_TIMED_KEYFRAMES)
 
+    def __repr__(self) -> str:
+        """List the numbers of frames and of drops."""
+        return f"Ledger({self.counts()}, drops={dict(self.drops.counts())})"
+
     def add_frame(self) -> None:
         """Count a posed frame, whatever happens to it next."""
         with self._lock:

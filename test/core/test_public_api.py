@@ -13,6 +13,7 @@ import fus3dmaps_core
 from fus3dmaps_core.answers.query import TextQuery, answer_query
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.errors import QueryError, StorageError
+from fus3dmaps_core.ledger import Ledger
 from fus3dmaps_core.pipeline import Pipeline
 from fus3dmaps_core.saved_maps import storage
 from fus3dmaps_core.saved_maps.storage import load_map, save_map
@@ -101,3 +102,14 @@ def test_a_pipeline_is_saved_whole_and_a_loaded_map_is_asked(pipeline: Pipeline,
     storage._text_encoder.cache_clear()
     with pytest.raises(StorageError, match="nowhere"):
         load_map(str(tmp_path / "nowhere"))
+
+
+def test_a_frame_and_a_ledger_say_what_they_are_without_their_arrays():
+    assert repr(wall_frame(7, x_m=0.25)) == "PosedFrame(7 ns, colour 640x480, depth 640x480, camera at (0.25, 0.00, 0.00) m)"
+    ledger = Ledger()
+    ledger.add_frame()
+    ledger.drops.add("no_pose", "pose: none", 2)
+    assert repr(ledger) == (
+        "Ledger(FrameCounts(frames=1, not_keyframes=0, dense_keyframes=0, instance_keyframes=0, proposals=0), "
+        "drops={'no_pose': 2})"
+    )

@@ -75,7 +75,11 @@ class LoopCache(NullCache):  # type: ignore[misc]
         """Keep a compiled loop in the first folder that takes it."""
         if result.library.has_dynamic_globals:  # Addresses of this process.
             return
-        name, code = self._file_name(signature, result.codegen), dumps(result._reduce())
+        try:
+            name, code = self._file_name(signature, result.codegen), dumps(result._reduce())
+        except Exception as error:  # A later numba may keep its results in another way.
+            _LOG.warning("compiled loop '%s' cannot be kept: %s", self._name, error)
+            return
         for folder in _folders():
             try:
                 cache_folders.make(folder)
