@@ -13,6 +13,7 @@ from reference.steps import Setting, random_steps
 from reference.variants import BACKENDS
 
 from fus3dmaps_core.voxel_map import kernels
+from fus3dmaps_core.voxel_map.layer_query import LayerQuery
 from fus3dmaps_core.voxel_map.layers.similarity import LAYERS
 from fus3dmaps_core.voxel_map.warm_up import warm_up
 
@@ -41,5 +42,5 @@ def test_a_map_runs_only_what_was_compiled_in_the_rehearsal(dtype):
     texts = np.ones((3, setting.dimension), np.float32)
     for layer in LAYERS:
         for prompts in (texts, texts[:1]):
-            engine.search(layer, prompts, texts)
+            engine.search(LayerQuery(layer, prompts, texts))
     assert compiled() == rehearsed
