@@ -138,7 +138,7 @@ def copy(tmp_path) -> Copy:
 def test_the_sources_of_the_real_loops_are_found_through_their_imports():
     names = {f"{path.parent.name}/{path.name}" for path in source_files()}
     loops = {f"kernels/{path.name}" for path in Path(cache_folders.__file__).parent.glob("numba_*.py")}
-    assert loops | {"kernels/protocols.py", "kernels/keys.py", "rows/rounding.py", "rows/rows.py"} <= names
+    assert loops | {"kernels/protocols.py", "kernels/keys.py", "rows/rounding.py", "rows/row_pool.py"} <= names
     assert "kernels/torch_kernels.py" not in names
     assert "voxel_map/semantic_map.py" not in names
 
