@@ -76,6 +76,9 @@ class PosedFrame:
         Raises:
             FrameError: Reasons ``bad_image``, ``bad_depth``, ``size_mismatch`` or ``bad_pose``.
         """
+        for name, reason in (("rgb", "bad_image"), ("depth_m", "bad_depth"), ("T_world_camera", "bad_pose")):
+            if not isinstance(getattr(self, name), np.ndarray):
+                raise FrameError(f"{name} must be a numpy array, is a {type(getattr(self, name)).__name__}", reason=reason)
         if self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.dtype != np.uint8 or self.rgb.size == 0:
             raise FrameError(f"rgb image must be (H, W, 3) uint8, got {self.rgb.shape} {self.rgb.dtype}", reason="bad_image")
         if self.depth_m.ndim != 2 or self.depth_m.dtype != np.float32 or self.depth_m.size == 0:

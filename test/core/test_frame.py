@@ -43,6 +43,9 @@ not_a_number[0, 3] = np.nan
         ({"T_world_camera": mirrored}, "bad_pose"),
         ({"T_world_camera": 2 * np.eye(4)}, "bad_pose"),
         ({"T_world_camera": np.eye(3)}, "bad_pose"),
+        ({"rgb": None}, "bad_image"),
+        ({"depth_m": [[1.0]]}, "bad_depth"),
+        ({"T_world_camera": np.eye(4).tolist()}, "bad_pose"),
     ],
 )
 def test_refusals_carry_their_reason(changes, reason):
