@@ -7,6 +7,8 @@ import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from fus3dmaps_core.version import __version__
+
 if TYPE_CHECKING:
     from fus3dmaps_core.answers.query import TextQuery
     from fus3dmaps_core.config.schema import Config
@@ -16,8 +18,6 @@ if TYPE_CHECKING:
     from fus3dmaps_core.saved_maps.storage import load_map, save_map
     from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 
-__version__ = "0.1.0"
-
 __all__ = [
     "Config",
     "Intrinsics",
@@ -25,6 +25,7 @@ __all__ = [
     "PosedFrame",
     "SemanticMap",
     "TextQuery",
+    "__version__",
     "load_map",
     "map_recording",
     "save_map",

@@ -34,7 +34,6 @@ class ImportGraph:
 
     An import counts wherever it stands: at the top, inside a function, and under ``TYPE_CHECKING`` too, because a reader who
     wants to know what a name means has to follow it all the same. ``from package import module`` is an import of the module.
-    ``__version__`` is no import: a package is always loaded before its modules, and sets it first.
 
     Attributes:
         modules: Path of every module by its name; a package is the module of its ``__init__.py``.
@@ -83,7 +82,7 @@ class ImportGraph:
 
     def _from(self, node: ast.ImportFrom, package: str) -> list[str]:
         base = _absolute(node.level, node.module or "", package)
-        names = [f"{base}.{alias.name}" for alias in node.names if alias.name != "__version__"]
+        names = [f"{base}.{alias.name}" for alias in node.names]
         return [name if name in self.modules else base for name in names]
 
     def _text(self, text: str, package: str) -> list[str]:

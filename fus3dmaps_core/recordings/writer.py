@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
-from fus3dmaps_core import __version__
 from fus3dmaps_core.config.input import InputConfig
 from fus3dmaps_core.errors import ConfigError, FrameError, RecordingError
 from fus3dmaps_core.frame import Intrinsics, PosedFrame
 from fus3dmaps_core.messages.fields import transform_from
+from fus3dmaps_core.version import __version__
 
 CAMERA_FRAME = "camera_optical_frame"
 

@@ -8,12 +8,12 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.encoders.weights import cache_directory
 from fus3dmaps_core.runtimes.cached_files import graph_hash, slug
 from fus3dmaps_core.runtimes.onnx_writer import OPSET
+from fus3dmaps_core.version import __version__
 
 _FINGERPRINT_DIGITS = 16
 

@@ -13,12 +13,12 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from fus3dmaps_core import __version__
 from fus3dmaps_core.config.schema import Precision
 from fus3dmaps_core.encoders.network_graphs import Graph
 from fus3dmaps_core.errors import EncoderError, first_line
 from fus3dmaps_core.runtimes.cached_files import external_data
 from fus3dmaps_core.runtimes.half_precision import round_products
+from fus3dmaps_core.version import __version__
 
 OPSET = 18
 """Of ONNX; TensorRT 10 and ONNX Runtime read it, and torch's exporter writes it without conversion."""

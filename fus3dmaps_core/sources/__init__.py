@@ -1,1 +1,1 @@
-"""Sources of posed frames: recordings and simulated scenes; datasets become recordings."""
+"""From messages of cameras and a localisation to posed frames, live and from recordings."""

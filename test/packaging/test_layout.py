@@ -219,7 +219,6 @@ def test_imports_that_go_down_are_no_violation(tmp_path) -> None:
     graph = tree(
         tmp_path,
         fus3dmaps_core__frame="from . import errors",
-        fus3dmaps_core__encoders__a="from fus3dmaps_core import __version__",
         fus3dmaps_core__voxel_map__a="from .layers import b; from .rows import c",
         fus3dmaps_core__a_count="import numpy, fus3dmaps_core.config",
         fus3dmaps_core__geometry__a="import fus3dmaps_core.a_count",
