@@ -39,8 +39,6 @@ class GraphEncoder(Protocol):
 
     def graph(self, height: int, width: int) -> Graph:
         """Describe its network at the shape that it is run at for an image of this size, pixels."""
-        ...
 
     def run_with(self, network: Network) -> None:
         """Run another network in place of its own; it takes and returns tensors of the encoder's device."""
-        ...

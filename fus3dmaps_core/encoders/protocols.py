@@ -34,11 +34,9 @@ class PatchEncoder(Protocol):
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Return rows and columns of the patch grid for an image of this size, without running the model."""
-        ...
 
     def encode_patches(self, rgb: NDArray[np.uint8]) -> PatchEmbeddings:
         """Embed the patches of an (H, W, 3) image."""
-        ...
 
 
 class CropEncoder(Protocol):
@@ -54,7 +52,6 @@ class CropEncoder(Protocol):
         Returns:
             (n, d) float32, unit length.
         """
-        ...
 
 
 class TextEncoder(Protocol):
@@ -63,7 +60,6 @@ class TextEncoder(Protocol):
     @property
     def space(self) -> str:
         """Registry name of its trio; a map of another one refuses its queries."""
-        ...
 
     def encode_text(self, prompts: Sequence[str]) -> NDArray[np.float32]:
         """Embed n prompts; templates, where the trio uses them, are applied in here.
@@ -71,7 +67,6 @@ class TextEncoder(Protocol):
         Returns:
             (n, d) float32, unit length.
         """
-        ...
 
 
 @dataclass(frozen=True)

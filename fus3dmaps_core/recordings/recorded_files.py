@@ -38,22 +38,17 @@ class RecordedFiles(Protocol):
     @property
     def topics(self) -> dict[str, TopicSummary]:
         """Summaries of the topics, by name."""
-        ...
 
     @property
     def start_ns(self) -> int:
         """Earliest time of recording, nanoseconds."""
-        ...
 
     @property
     def end_ns(self) -> int:
         """Latest time of recording, nanoseconds."""
-        ...
 
     def messages(self, topics: Collection[str] | None) -> Iterator[RawMessage]:
         """Yield the messages of the given topics, or of all."""
-        ...
 
     def close(self) -> None:
         """Release the files."""
-        ...

@@ -74,12 +74,10 @@ class Savable(Protocol):
     @property
     def semantic_map(self) -> SemanticMap:
         """The map."""
-        ...
 
     @property
     def info(self) -> MapInfo:
         """What is to be known besides."""
-        ...
 
 
 class SavedMap(NamedTuple):

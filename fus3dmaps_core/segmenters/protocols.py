@@ -20,4 +20,3 @@ class Segmenter(Protocol):
             rgb: (H, W, 3) uint8.
             depth_m: (H, W) float32 metres, 0 where there is no reading; a segmenter may ignore it.
         """
-        ...

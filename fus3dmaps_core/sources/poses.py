@@ -52,7 +52,6 @@ class PoseProvider(Protocol):
 
     def body_frame(self, moment: Moment) -> str:
         """Return the name of the body's frame in TF; empty if it is not known."""
-        ...
 
     def at(self, moment: Moment) -> NDArray[np.float64] | None:
         """Return T_world_body at an image's stamp, (4, 4) float64, or None while it may still come.
@@ -61,15 +60,12 @@ class PoseProvider(Protocol):
             FrameError: It will not come: reasons ``no_pose``, ``pose_gap``, ``tf_unknown_frame``, ``tf_not_connected`` or
                 ``bad_transform``.
         """
-        ...
 
     def forget_before(self, stamp_ns: int) -> None:
         """Remove poses that no image of this stamp or later needs."""
-        ...
 
     def clear(self) -> None:
         """Remove all poses, because time restarts."""
-        ...
 
 
 class BufferedPoses:

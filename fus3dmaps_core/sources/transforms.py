@@ -55,11 +55,9 @@ class TransformBuffer(Protocol):
         Returns:
             (4, 4) float64 T_target_source, or why there is none.
         """
-        ...
 
     def clear(self) -> None:
         """Remove all moving transforms; static ones stay."""
-        ...
 
 
 class TransformTree:

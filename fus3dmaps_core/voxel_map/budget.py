@@ -90,27 +90,21 @@ class BudgetedMap(Protocol):
     @property
     def window_radius_m(self) -> float:
         """Effective radius of the sliding window, metres; 0 without one."""
-        ...
 
     def memory_use(self, bound: KeyframeBound) -> MemoryUse:
         """Return what the map takes, and would take after a keyframe of at most this size."""
-        ...
 
     def set_window_radius(self, radius_m: float) -> None:
         """Change the effective radius of the sliding window."""
-        ...
 
     def prune_window(self, center_m: NDArray[np.floating]) -> int:
         """Drop the dense embeddings outside the window; returns how many."""
-        ...
 
     def drop_least_observed(self, count: int) -> int:
         """Drop the dense embeddings of the least observed voxels; returns how many."""
-        ...
 
     def release_unused(self) -> int:
         """Give back memory that no dense embedding is in; returns the bytes."""
-        ...
 
 
 class MemoryBudget:

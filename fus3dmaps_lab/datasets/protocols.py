@@ -39,21 +39,17 @@ class Dataset(Protocol):
     @property
     def name(self) -> str:
         """Name of the layout in the registry."""
-        ...
 
     @property
     def scene(self) -> str:
         """Name of the scene."""
-        ...
 
     @property
     def intrinsics(self) -> Intrinsics:
         """Camera model of the colour images."""
-        ...
 
     def __len__(self) -> int:
         """Count the frames that an iteration yields."""
-        ...
 
     def __iter__(self) -> Iterator[PosedFrame]:
         """Yield the frames in order of their stamps.
@@ -61,7 +57,6 @@ class Dataset(Protocol):
         Raises:
             RecordingError: A file cannot be read or has the wrong content; the message names the file.
         """
-        ...
 
 
 class LabelledDataset(Dataset, Protocol):
@@ -70,12 +65,10 @@ class LabelledDataset(Dataset, Protocol):
     @property
     def class_names(self) -> tuple[str, ...]:
         """Name by class id; 0 means unlabelled, and its name is empty."""
-        ...
 
     @property
     def background(self) -> frozenset[int]:
         """Ids of wall, floor, ceiling and similar classes."""
-        ...
 
     def label_image(self, index: int) -> NDArray[np.int32]:
         """Return the (H, W) class ids of the pixels of frame ``index``'s colour image; 0 is unlabelled.
@@ -83,7 +76,6 @@ class LabelledDataset(Dataset, Protocol):
         Raises:
             RecordingError: The scene has no label images, or this one cannot be used; the message names the file.
         """
-        ...
 
     def instance_image(self, index: int) -> NDArray[np.int32] | None:
         """Return (H, W) instance ids, 0 for none; None if the scene has no such images.
@@ -91,7 +83,6 @@ class LabelledDataset(Dataset, Protocol):
         Raises:
             RecordingError: The image cannot be used; the message names the file.
         """
-        ...
 
     def ground_truth_points(self) -> TruePoints | None:
         """Return labelled points of the surface; None if the labels are those of the label images.
@@ -99,4 +90,3 @@ class LabelledDataset(Dataset, Protocol):
         Raises:
             RecordingError: The file of the surface cannot be used; the message names it.
         """
-        ...

@@ -46,7 +46,7 @@ _SCAN_SLOTS = 8192  # Of a scan, the same.
 
 
 class CompiledKernels:
-    """Kernels as compiled loops. Results do not depend on the number of threads."""
+    """:class:`Kernels` as compiled loops. Results do not depend on the number of threads."""
 
     def __init__(self) -> None:
         """Prepare threads and memory. numba compiles each loop at its first call, or takes it from its cache."""
@@ -59,13 +59,11 @@ class CompiledKernels:
         return self._scratch.nbytes
 
     def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
-        """Implement :meth:`Kernels.voxel_keys`."""
         keys = np.empty(len(points_m), np.int64)
         largest = numba_points.voxel_keys(points_m.contiguous().numpy(), voxel_size_m, HALF, BITS, keys)
         return torch.from_numpy(keys), float(largest)
 
     def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
-        """Implement :meth:`Kernels.unit_rows`."""
         if values.dtype not in (torch.float32, torch.float64):
             values = values.to(torch.float32)
         units = np.empty(values.shape, np.float32)
@@ -73,13 +71,13 @@ class CompiledKernels:
         return torch.from_numpy(units), max(failures)
 
     def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Implement :meth:`Kernels.distinct`: in the order of first appearance."""
+        # In the order of first appearance.
         unique, inverse, counts = (np.empty(len(keys), np.int64) for _ in range(3))
         found = numba_points.distinct(keys.numpy(), unique, inverse, counts)
         return torch.from_numpy(unique[:found]), torch.from_numpy(inverse), torch.from_numpy(counts[:found])
 
     def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
-        """Implement :meth:`Kernels.count_pairs`: partners of a group in the order of first appearance."""
+        # Partners of a group in the order of first appearance.
         offsets = np.empty(groups + 1, np.int64)
         found, counts = np.empty(len(first), np.int64), np.empty(len(first), np.int64)
         numba_points.count_pairs(first.numpy(), second.numpy(), partners, offsets, found, counts)
@@ -87,17 +85,14 @@ class CompiledKernels:
         return GroupedCounts(torch.from_numpy(offsets), torch.from_numpy(found[:end]), torch.from_numpy(counts[:end]))
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
-        """Implement :meth:`Kernels.find`."""
         slots = np.empty(len(keys), np.int64)
         numba_points.find(table.keys.numpy(), table.slots.numpy(), _shift(table), EMPTY, keys.numpy(), slots)
         return torch.from_numpy(slots)
 
     def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
-        """Implement :meth:`Kernels.place`."""
         numba_points.place(table.keys.numpy(), table.slots.numpy(), _shift(table), EMPTY, keys.numpy(), slots.numpy())
 
     def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
-        """Implement :meth:`Kernels.mark_deleted`."""
         numba_points.mark_deleted(table.keys.numpy(), _shift(table), DELETED, keys.numpy())
 
     def merge_means(
@@ -111,7 +106,6 @@ class CompiledKernels:
         amounts: Tensor,
         embeddings: Tensor,
     ) -> None:
-        """Implement :meth:`Kernels.merge_means`."""
         arrays = (rows, old, new, seeds, groups.offsets, groups.partners, amounts, embeddings.contiguous())
         pooled = (*stored(pool), pool.scales[:].numpy())
         self._share(numba_rows.merge_means, len(rows), pool.dimension, *pooled, *(each.numpy() for each in arrays))
@@ -125,7 +119,6 @@ class CompiledKernels:
         iou_threshold: float,
         hidden_of_row: Tensor | None = None,
     ) -> Association:
-        """Implement :meth:`Kernels.associate`."""
         matched, ids = (np.empty(len(proposals.offsets) - 1, np.int64) for _ in range(2))
         dead = np.empty(len(hypotheses.id_of_row), np.int64)
         created, died = numba_instances.associate(
@@ -150,19 +143,16 @@ class CompiledKernels:
         return Association(torch.from_numpy(matched), torch.from_numpy(ids), int(created), died_rows)
 
     def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """Implement :meth:`Kernels.holders`."""
         with self._scratch.lend((len(held_row),), np.int64) as slots:
             found = numba_instances.holders(held_row.numpy(), rows.numpy(), np.zeros(row_count, np.bool_), slots)
             return torch.from_numpy(slots[:found].copy())
 
     def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """Implement :meth:`Kernels.shared_voxels`."""
         shared = np.zeros((len(rows), len(rows)), np.int64)
         numba_instances.shared_voxels(held_row.numpy(), rows.numpy(), np.full(row_count, -1, np.int32), shared)
         return torch.from_numpy(shared)
 
     def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
-        """Implement :meth:`Kernels.merge`."""
         numba_instances.merge(
             slots.numpy(),
             gone.numpy(),
@@ -177,13 +167,12 @@ class CompiledKernels:
         )
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """Implement :meth:`Kernels.top_hypotheses`."""
         rows, counts = np.empty(len(slots), np.int32), np.empty(len(slots), np.int32)
         numba_scan.top_hypotheses(slots.numpy(), *_held(hypotheses), rows, counts)
         return torch.from_numpy(rows).to(torch.int64), torch.from_numpy(counts).to(torch.int64)
 
     def scan_limit(self, texts: int) -> int:
-        """Implement :meth:`Kernels.scan_limit`: parts of a scan are small, so only the room for its result counts."""
+        # Parts of a scan are small, so only the room for its result counts.
         return 2**20
 
     def scan(
@@ -196,7 +185,6 @@ class CompiledKernels:
         threshold: float,
         room_for: ScoredVoxels,
     ) -> tuple[int, int]:
-        """Implement :meth:`Kernels.scan`."""
         asked = _asked(layer)
         slots, rows, sums_width = len(block.keys), len(hypotheses.id_of_row), 0 if sums is None else asked.prompts + 1
         parts = cuts(slots, _SCAN_SLOTS)
@@ -237,26 +225,22 @@ class CompiledKernels:
         return sum(found), end
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
-        """Implement :meth:`Kernels.farther`."""
         places = np.empty(len(keys), np.int64)
         found = numba_points.farther(keys.numpy(), voxel_size_m, HALF, BITS, point_m.numpy(), radius_m, places)
         return torch.from_numpy(places[:found])
 
     def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
-        """Implement :meth:`Kernels.centers`."""
         centers = np.empty((len(keys), 3), np.float32)
         numba_points.centers(keys.numpy(), voxel_size_m, HALF, BITS, centers)
         return torch.from_numpy(centers)
 
     def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
-        """Implement :meth:`Kernels.cosines`."""
         found = np.empty((len(rows), len(texts)), np.float32)
         arrays = (rows.numpy(), texts.contiguous().numpy(), found)
         self._share(numba_cosines.cosines, len(rows), pool.dimension, *stored(pool), *arrays)
         return torch.from_numpy(found)
 
     def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
-        """Implement :meth:`Kernels.fuse`."""
         pool, count = voxels.pool, len(rows)
         place = np.full(own.high_water, -1, np.int32)
         place[rows.numpy()] = np.arange(count, dtype=np.int32)

@@ -226,7 +226,6 @@ class Kernels(Protocol):
             (n,) int64 keys, and the largest coordinate's size: keys mean nothing if that is beyond MAX_COORDINATE, or NaN
             because a point is not finite.
         """
-        ...
 
     def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
         """Scale rows (n, d) of any length to unit length.
@@ -234,27 +233,21 @@ class Kernels(Protocol):
         Returns:
             (n, d) float32 and 0; or nothing of meaning and 1, a value is not finite, or 2, a row has length 0.
         """
-        ...
 
     def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Find the distinct keys, in an order that the input alone decides, the place of each input, and counts: int64."""
-        ...
 
     def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
         """Count equal (first, second) pairs, (n,) int64 in [0, groups) and [0, partners), grouped by first."""
-        ...
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
         """Look up the slots of the keys, -1 where the table lacks one: (n,) int64."""
-        ...
 
     def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
         """Put distinct keys that the table lacks into it, which must have room."""
-        ...
 
     def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
         """Mark distinct keys that the table has as deleted."""
-        ...
 
     def merge_means(
         self,
@@ -279,7 +272,6 @@ class Kernels(Protocol):
             amounts: One float32 for each of the groups' partners.
             embeddings: (p, d) float32.
         """
-        ...
 
     def associate(
         self,
@@ -301,11 +293,9 @@ class Kernels(Protocol):
             hidden_of_row: (rows,) int32, how many of an instance's voxels do not count in the IoU's union, none of them one
                 of a proposal's; None where all count.
         """
-        ...
 
     def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
         """Find the slots that hold any of some instances, (n,) int64 ascending; arguments as of :meth:`shared_voxels`."""
-        ...
 
     def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
         """Count the voxels that each two of some instances share, in one pass over slots.
@@ -318,7 +308,6 @@ class Kernels(Protocol):
         Returns:
             (m, m) int64, symmetrical; on the diagonal how many voxels each has.
         """
-        ...
 
     def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
         """Let instances take in others.
@@ -331,15 +320,12 @@ class Kernels(Protocol):
             gone: (n,) int64 distinct rows of the instances that are taken in.
             into: (n,) int64 rows of those that take them in, none of them gone; one may take in several.
         """
-        ...
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
         """Find per slot the row with the highest count (ties: the lowest id; -1 without one) and that count: (n,) int64."""
-        ...
 
     def scan_limit(self, texts: int) -> int:
         """Return how many slots may be scanned at a time, compared with so many texts, for its memory to stay small."""
-        ...
 
     def scan(
         self,
@@ -366,19 +352,15 @@ class Kernels(Protocol):
         Returns:
             How many voxels have the layer, and how many were written.
         """
-        ...
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
         """Find the keys whose voxel's centre is farther than a radius from a point (3,) float64: places, int64 ascending."""
-        ...
 
     def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
         """Compute the centres of voxels: (n, 3) float32, metres."""
-        ...
 
     def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
         """Compute the cosines of the rows with unit vectors (p, d): (n, p) float32."""
-        ...
 
     def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
         """Fuse instances: target[row] <- (sum of w f over the voxels that hold it + amount own[row]) / evidence.
@@ -396,4 +378,3 @@ class Kernels(Protocol):
         Returns:
             (n,) float64 evidence.
         """
-        ...

@@ -35,10 +35,9 @@ _SCANNED_SLOTS = 2**17  # Of hypotheses, the same.
 
 
 class TorchKernels:
-    """Kernels as tensor operations; only proposals, whose order matters, are taken one by one."""
+    """:class:`Kernels` as tensor operations. Only proposals, whose order matters, are taken one by one."""
 
     def voxel_keys(self, points_m: Tensor, voxel_size_m: float) -> tuple[Tensor, float]:
-        """Implement :meth:`Kernels.voxel_keys`."""
         if not len(points_m):
             return torch.zeros(0, dtype=torch.int64, device=points_m.device), 0.0
         coordinates = torch.floor(points_m.to(torch.float64) / voxel_size_m)
@@ -46,7 +45,6 @@ class TorchKernels:
         return pack(coordinates.nan_to_num(0.0).clamp(-MAX_COORDINATE, MAX_COORDINATE)), largest
 
     def unit_rows(self, values: Tensor) -> tuple[Tensor, int]:
-        """Implement :meth:`Kernels.unit_rows`."""
         wide = values.to(torch.float64)
         if not bool(torch.isfinite(wide).all()):
             return values, 1
@@ -57,12 +55,12 @@ class TorchKernels:
         return normalize(wide / largest, dim=1).to(torch.float32), 0
 
     def distinct(self, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Implement :meth:`Kernels.distinct`: in ascending order."""
+        # In ascending order.
         unique, inverse, counts = torch.unique(keys, return_inverse=True, return_counts=True)
         return unique, inverse, counts
 
     def count_pairs(self, first: Tensor, second: Tensor, groups: int, partners: int) -> GroupedCounts:
-        """Implement :meth:`Kernels.count_pairs`: partners of a group in ascending order."""
+        # Partners of a group in ascending order.
         pairs, counts = torch.unique(first * partners + second, return_counts=True)
         offsets = torch.zeros(groups + 1, dtype=torch.int64, device=first.device)
         if len(pairs):
@@ -71,7 +69,6 @@ class TorchKernels:
         return GroupedCounts(offsets, pairs, counts)
 
     def find(self, table: HashTable, keys: Tensor) -> Tensor:
-        """Implement :meth:`Kernels.find`."""
         slots = torch.full_like(keys, -1)
         rows = torch.arange(len(keys), device=keys.device)
         cells = home(keys, len(table.keys))
@@ -84,7 +81,6 @@ class TorchKernels:
         return slots
 
     def place(self, table: HashTable, keys: Tensor, slots: Tensor) -> None:
-        """Implement :meth:`Kernels.place`."""
         cells = home(keys, len(table.keys))
         while len(keys):
             free = table.keys[cells] == EMPTY
@@ -95,7 +91,6 @@ class TorchKernels:
             keys, slots, cells = keys[~won], slots[~won], (cells[~won] + 1) & (len(table.keys) - 1)
 
     def mark_deleted(self, table: HashTable, keys: Tensor) -> None:
-        """Implement :meth:`Kernels.mark_deleted`."""
         cells = home(keys, len(table.keys))
         while len(keys):
             hit = table.keys[cells] == keys
@@ -113,7 +108,6 @@ class TorchKernels:
         amounts: Tensor,
         embeddings: Tensor,
     ) -> None:
-        """Implement :meth:`Kernels.merge_means`."""
         known = old > 0
         means = torch.where(known[:, None], pool.read(rows), 0.0)
         sums = embedding_bag(groups.partners, embeddings, groups.offsets[:-1], mode="sum", per_sample_weights=amounts)
@@ -129,7 +123,6 @@ class TorchKernels:
         iou_threshold: float,
         hidden_of_row: Tensor | None = None,
     ) -> Association:
-        """Implement :meth:`Kernels.associate`."""
         matched, ids, dead, created = [], [], [], 0
         ends = proposals.offsets.tolist()
         for start, end in itertools.pairwise(ends):
@@ -153,7 +146,6 @@ class TorchKernels:
         return Association(rows, given, created, died)
 
     def holders(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """Implement :meth:`Kernels.holders`."""
         if not len(rows):
             return rows
         is_wanted = torch.zeros(row_count + 1, dtype=torch.bool, device=held_row.device)
@@ -162,7 +154,6 @@ class TorchKernels:
         return torch.nonzero(torch.cat(holds)).squeeze(1)
 
     def shared_voxels(self, held_row: Tensor, rows: Tensor, row_count: int) -> Tensor:
-        """Implement :meth:`Kernels.shared_voxels`."""
         count = len(rows)
         place_of_row = torch.full((row_count + 1,), -1, dtype=torch.int64, device=held_row.device)
         place_of_row[rows] = torch.arange(count, device=held_row.device)  # Row -1, an empty place, finds the last one.
@@ -176,7 +167,6 @@ class TorchKernels:
         return shared.view(count, count)
 
     def merge(self, hypotheses: Hypotheses, slots: Tensor, gone: Tensor, into: Tensor) -> None:
-        """Implement :meth:`Kernels.merge`."""
         target_of_row = torch.full((len(hypotheses.id_of_row) + 1,), -1, dtype=torch.int64, device=slots.device)
         target_of_row[gone] = into  # Row -1, an empty place, finds the last one.
         hypotheses.id_of_row[gone] = -1
@@ -187,7 +177,6 @@ class TorchKernels:
             _rename(hypotheses, part, target_of_row)
 
     def top_hypotheses(self, hypotheses: Hypotheses, slots: Tensor) -> tuple[Tensor, Tensor]:
-        """Implement :meth:`Kernels.top_hypotheses`."""
         rows = hypotheses.held_row[slots].to(torch.int64)
         counts = hypotheses.held_count[slots].to(torch.int64)
         if not len(hypotheses.id_of_row):
@@ -196,7 +185,6 @@ class TorchKernels:
         return rows.gather(1, column).squeeze(1), counts.gather(1, column).squeeze(1)
 
     def scan_limit(self, texts: int) -> int:
-        """Implement :meth:`Kernels.scan_limit`."""
         return min(2**17, max(256, 2**20 // max(texts, 1)))
 
     def scan(
@@ -209,7 +197,6 @@ class TorchKernels:
         threshold: float,
         room_for: ScoredVoxels,
     ) -> tuple[int, int]:
-        """Implement :meth:`Kernels.scan`."""
         slots = torch.arange(block.first, block.first + len(block.keys), device=block.keys.device)
         top_rows, top_counts = self.top_hypotheses(hypotheses, slots)
         owned = top_rows >= 0
@@ -239,16 +226,13 @@ class TorchKernels:
         return len(picked), count
 
     def farther(self, keys: Tensor, voxel_size_m: float, point_m: Tensor, radius_m: float) -> Tensor:
-        """Implement :meth:`Kernels.farther`."""
         offsets = (unpack(keys).to(torch.float64) + 0.5) * voxel_size_m - point_m
         return torch.nonzero(torch.linalg.vector_norm(offsets, dim=1) > radius_m).squeeze(1)
 
     def centers(self, keys: Tensor, voxel_size_m: float) -> Tensor:
-        """Implement :meth:`Kernels.centers`."""
         return ((unpack(keys).to(torch.float64) + 0.5) * voxel_size_m).to(torch.float32)
 
     def cosines(self, pool: RowPool, rows: Tensor, texts: Tensor) -> Tensor:
-        """Implement :meth:`Kernels.cosines`."""
         found = texts.new_empty((len(rows), len(texts)))
         for start in range(0, len(rows), _READ_ROWS):
             part = slice(start, start + _READ_ROWS)
@@ -256,7 +240,6 @@ class TorchKernels:
         return found
 
     def fuse(self, voxels: FusionRows, rows: Tensor, own: RowPool, amounts: Tensor, bars: Tensor, target: RowPool) -> Tensor:
-        """Implement :meth:`Kernels.fuse`."""
         place = torch.full((own.high_water,), -1, dtype=torch.int64, device=rows.device)
         place[rows] = torch.arange(len(rows), device=rows.device)
         sums, evidence = _weighted_sums(voxels, place, len(rows))
