@@ -50,7 +50,7 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], args: Sequence[str
         if node.autostart:
             # While it spins, so that a manager or an operator can see the state while the models load.
             node.bring_up()
-        spinning.result()
+        signals.wait_for(spinning)
     except KeyboardInterrupt:
         pass
     except REFUSALS as error:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
+from concurrent.futures import Future
+from threading import Timer
 from types import SimpleNamespace
 
 import pytest
@@ -44,3 +47,25 @@ def test_after_an_end_for_another_reason_no_signal_interrupts(signals, clock) ->
     stop.hold()
     signal.raise_signal(signal.SIGINT)
     assert stop.hurried
+
+
+def test_work_that_ends_is_waited_for_and_its_error_is_raised(signals) -> None:
+    stop, work, failing = StopSignals(), Future(), Future()
+    Timer(0.05, work.set_result, [None]).start()
+    stop.wait_for(work)
+    failing.set_exception(OSError("gone"))
+    with pytest.raises(OSError, match="gone"):
+        stop.wait_for(failing)
+
+
+@pytest.mark.parametrize("number", STOP_SIGNALS)
+def test_a_signal_ends_the_wait_even_if_what_it_raised_was_lost(signals, number) -> None:
+    stop = StopSignals()
+    Timer(0.05, signal.raise_signal, [number]).start()  # From a thread, as a process gets it from outside.
+    with pytest.raises(KeyboardInterrupt):
+        stop.wait_for(Future())
+    stop = StopSignals()
+    with contextlib.suppress(KeyboardInterrupt):
+        signal.raise_signal(number)
+    with pytest.raises(KeyboardInterrupt):
+        stop.wait_for(Future())
