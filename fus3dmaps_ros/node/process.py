@@ -54,9 +54,11 @@ def run_node(name: str, make_node: Callable[[], ManagedNode], args: Sequence[str
     except KeyboardInterrupt:
         pass
     except REFUSALS as error:
+        signals.hold()
         print(f"{name}: {one_line(error)}", file=sys.stderr)
         code = 1
     except Exception:
+        signals.hold()
         traceback.print_exc()
         code = 1
     _shut_down(name, node, executor, signals, code)

@@ -11,7 +11,6 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ECHO_S = 1.0
 """Signals within this time of the first are the same request: service managers signal a launch, and it signals nodes."""
 
-
 _LOOK_S = 0.5
 
 

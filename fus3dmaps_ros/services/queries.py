@@ -19,8 +19,9 @@ from fus3dmaps_core.answers.query import (
 )
 from fus3dmaps_core.config.schema import Config
 from fus3dmaps_core.messages.images import decode_color
+from fus3dmaps_core.voxel_map.semantic_map import SemanticMap
 from fus3dmaps_msgs.srv import LabelMap, ListInstances, QueryImage, QueryText
-from fus3dmaps_ros.node.session import SessionHolder
+from fus3dmaps_ros.node.session import Session, SessionHolder
 from fus3dmaps_ros.node.timed_calls import between_frames
 from fus3dmaps_ros.services.serving import Call, ServiceGroup
 from fus3dmaps_ros.topics import conversions
@@ -50,11 +51,9 @@ class QueryServices(ServiceGroup):
     def _query_text(self, request: Any, response: Any, call: Call) -> str:
         session = self._sessions.require()
         query, pipeline = self._to_query(request, list(request.prompts)), session.pipeline
+        scale = pipeline.trio.logit_scale
         return self._answer(
-            request,
-            response,
-            call,
-            lambda: answer_query(pipeline.semantic_map, session.text, query, pipeline.trio.logit_scale),
+            request, response, call, session, lambda mapped: answer_query(mapped, session.text, query, scale)
         )
 
     def _query_image(self, request: Any, response: Any, call: Call) -> str:
@@ -69,7 +68,8 @@ class QueryServices(ServiceGroup):
             request,
             response,
             call,
-            lambda: answer_image_query(pipeline.semantic_map, embedding, session.text, query, pipeline.trio.logit_scale),
+            session,
+            lambda mapped: answer_image_query(mapped, embedding, session.text, query, pipeline.trio.logit_scale),
         )
 
     def _label_map(self, request: Any, response: Any, call: Call) -> str:
@@ -105,11 +105,15 @@ class QueryServices(ServiceGroup):
         query.check()
         return query
 
-    def _answer(self, request: Any, response: Any, call: Call, find: Callable[[], QueryAnswer]) -> str:
-        """Find the answer, fill it into the response, and publish it if the request says so."""
+    def _answer(
+        self, request: Any, response: Any, call: Call, session: Session, find: Callable[[SemanticMap], QueryAnswer]
+    ) -> str:
+        """Find the answer in the map of this moment, fill it into the response, and publish it if the request says so."""
         # Before the map is read, so that its content may be newer than the stamp but never older.
         header = self._outputs.header()
-        found = call.in_time(find)
+        # Before the call waits for its turn, when another map may be loaded.
+        semantic_map = session.pipeline.semantic_map
+        found = call.in_time(lambda: find(semantic_map))
         response.instances = [conversions.to_instance(header, instance) for instance in found.instances]
         response.similarity = conversions.to_similarity_cloud(header, found)
         if request.publish:

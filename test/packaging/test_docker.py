@@ -126,7 +126,8 @@ def test_nothing_that_the_package_needs_is_missing(path, distribution, manifest)
 def test_the_image_has_done_what_a_first_start_does(path) -> None:
     steps = instructions(path)
     entry = steps.index(("COPY", "docker/entrypoint.sh /"))
-    assert ("RUN", "/bin/bash /entrypoint.sh python -m fus3dmaps_ros.commands.first_start") in steps[entry:]
+    # With -P it is the installed package that is prepared, not the sources in the working directory.
+    assert ("RUN", "/bin/bash /entrypoint.sh python -P -m fus3dmaps_ros.commands.first_start") in steps[entry:]
     assert (ROOT / "fus3dmaps_ros" / "commands" / "first_start.py").is_file()
 
 

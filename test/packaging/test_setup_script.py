@@ -179,6 +179,7 @@ def test_a_first_start_is_done_beforehand_once_for_each_content_of_the_compiled_
 
 def test_a_first_start_that_was_interrupted_is_done_again(ready_machine, tmp_path):
     code, _, starts = first_starts(ready_machine, tmp_path, LOOPS="a", FIRST_START="1")
-    assert (code != 0, starts) == (True, 1)
+    # Nothing depends on it: a set-up goes on without, and does it at the next chance.
+    assert (code, starts) == (0, 1)
     assert first_starts(ready_machine, tmp_path, LOOPS="a") == (0, 0, 1)
     assert first_starts(ready_machine, tmp_path, LOOPS="a") == (0, 0, 0)
