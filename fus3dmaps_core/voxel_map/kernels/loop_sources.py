@@ -33,6 +33,8 @@ def source_digest() -> str:
 def source_files() -> list[Path]:
     """List the modules with loops and all modules of this package that they import, directly or not."""
     waiting = list(_KERNELS.glob("numba_*.py"))
+    if not waiting:
+        raise FileNotFoundError(f"no sources of compiled loops in '{_KERNELS}'")
     found = set(waiting)
     while waiting:
         for path in _imports(waiting.pop()):
