@@ -7,6 +7,7 @@ compiled.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import logging
 import pickle
@@ -28,6 +29,9 @@ from fus3dmaps_core.voxel_map.kernels.loop_sources import source_digest
 
 _LOG = logging.getLogger(__name__)
 _CHECKSUM_BYTES = hashlib.sha256().digest_size
+
+with contextlib.suppress(OSError):
+    source_digest()  # Now, when the loops are imported: files that change later are not what this process compiles.
 
 
 def njit(*, cache: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
