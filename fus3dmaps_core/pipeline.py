@@ -123,7 +123,8 @@ class Pipeline:
         Raises:
             QueryError: The query is malformed, or the map or the layer is empty.
         """
-        return answer_query(self.semantic_map, self.trio.text, TextQuery.of(prompts, **options), self.trio.logit_scale)
+        query = TextQuery.of(prompts, self.config.query, **options)
+        return answer_query(self.semantic_map, self.trio.text, query, self.trio.logit_scale)
 
     @property
     def info(self) -> MapInfo:

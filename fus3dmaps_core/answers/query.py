@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fus3dmaps_core.config.schema import QueryConfig
 from fus3dmaps_core.encoders.protocols import CropEncoder, TextEncoder
 from fus3dmaps_core.errors import QueryError
 from fus3dmaps_core.masks import Masks
@@ -48,17 +49,24 @@ class TextQuery:
     top_k: int = 5
     min_voxels: int = 4
 
+    def __post_init__(self) -> None:
+        """Take a single text for a list of one; it is a sequence, too, of letters."""
+        for name in ("prompts", "negative_prompts"):
+            if isinstance(getattr(self, name), str):
+                object.__setattr__(self, name, (getattr(self, name),))
+
     @classmethod
-    def of(cls, prompts: str | Sequence[str] | TextQuery, **options: Any) -> TextQuery:
+    def of(cls, prompts: str | Sequence[str] | TextQuery, defaults: QueryConfig, **options: Any) -> TextQuery:
         """Make a query of one prompt, of several, or return the query that is given.
 
         Args:
             prompts: What to look for.
+            defaults: What holds for a query that does not say it.
             **options: Other attributes of the query, by name.
         """
         if isinstance(prompts, TextQuery):
             return replace(prompts, **options)
-        return cls([prompts] if isinstance(prompts, str) else list(prompts), **options)
+        return cls(prompts, **{"top_k": defaults.top_k, "min_voxels": defaults.min_voxels, **options})
 
     def in_embeddings(self, prompts: NDArray[np.float32], negatives: NDArray[np.float32], logit_scale: float) -> LayerQuery:
         """Replace the words by their embeddings: (p, d) of the prompts, (q, d) of the negative prompts."""

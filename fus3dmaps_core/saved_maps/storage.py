@@ -103,7 +103,8 @@ class SavedMap(NamedTuple):
             EncoderError: The text encoder cannot be loaded here.
         """
         encoder = _text_encoder(self.info.encoder, self.info.config.encoder.weights)
-        return answer_query(self.semantic_map, encoder, TextQuery.of(prompts, **options), self.info.logit_scale)
+        query = TextQuery.of(prompts, self.info.config.query, **options)
+        return answer_query(self.semantic_map, encoder, query, self.info.logit_scale)
 
     def __repr__(self) -> str:
         """Say how much the map holds and where it comes from."""

@@ -105,7 +105,7 @@ class MapScan:
 
     def search(self, query: LayerQuery, texts: Texts) -> Finding:
         """Answer a query, whose prompts and negatives are given as unit vectors."""
-        threshold = -np.inf if query.threshold is None else query.threshold
+        threshold = -np.inf if query.threshold is None else float(query.threshold)  # Loops are compiled by type.
         answer = _Answer(self._state.hash.high_water, threshold, self._device)
         best: list[tuple[NDArray[np.int64], NDArray[np.float64]]] = []
         for done in self._passes(query.layer, texts, answer):

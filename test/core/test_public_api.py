@@ -113,3 +113,12 @@ def test_a_frame_and_a_ledger_say_what_they_are_without_their_arrays():
         "Ledger(FrameCounts(frames=1, not_keyframes=0, dense_keyframes=0, instance_keyframes=0, proposals=0), "
         "drops={'no_pose': 2})"
     )
+
+
+def test_a_query_that_does_not_say_takes_what_is_configured_and_a_text_is_one_text():
+    made = Pipeline(Config.from_flat({"query.top_k": 1, "query.min_voxels": 10_000}), color_trio(), ColorSegmenter())
+    made.process(wall_frame(1))
+    assert made.ask("red").instances == []
+    assert len(made.ask("red", min_voxels=1).instances) == 1
+    for query in (TextQuery("red", "grey"), TextQuery.of("red", Config().query, negative_prompts="grey")):
+        assert (query.prompts, query.negative_prompts) == (("red",), ("grey",))
